@@ -192,7 +192,7 @@ def _with_found(message: AverageMessage, corrected: CorrectedAmplitudes) -> Aver
     size, expected = np.abs(corrected.amplitudes), corrected.expected
     columns = {
         'corrected_amplitude': size, 'corrected_phase': np.angle(corrected.amplitudes),
-        'attenuation': expected.factor,
+        'attenuation': np.broadcast_to(expected.factor, size.shape),
         'attenuation_standard_error': np.broadcast_to(
             expected.standard_deviation, size.shape),
         'corrected_standard_error': corrected.standard_errors,

@@ -76,14 +76,13 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
                      for order in wanted])
     kept &= (rough.evidence > _PRESENT) & (wanted * rough.speed.max() < _BAND * rate)
     strongest = np.argsort(-np.where(kept, rough.evidence, -np.inf))[:_MOST_ORDERS]
-    lines = [(float(wanted[k]), channel) for k in sorted(strongest.tolist()) if kept[k]
-             for channel in range(len(samples))]
-    phase = _phase(samples, rate, rough, lines) if lines else None
+    used = wanted[np.sort(strongest)][kept[np.sort(strongest)]]
+    phase = _phase(samples, rate, rough, used) if used.size else None
     if phase is None:
         raise SignalError('no line is strong and steady enough to follow its phase: give other '
                           'orders, fewer in hold_out, or a sensor nearer to their source')
     first, last, reason = _stretch(phase, rough, start)
-    return FoundPulses.between(phase, first, last, start, wanted, len(samples), reason)
+    return FoundPulses.between(phase, first, last, start, wanted, reason)
 
 
 def _checked(vibration: ArrayLike) -> FloatArray:
@@ -130,11 +129,10 @@ def _range(speed_range: Sequence[float], rate: float, orders: FloatArray) -> tup
     return float(found[0]), float(found[1])
 
 
-def _phase(samples: FloatArray, rate: float, rough: Rough, lines: list[tuple[float, int]]
+def _phase(samples: FloatArray, rate: float, rough: Rough, orders: FloatArray
            ) -> Phase | None:
     """Return the phase in cells that part the orders of lines from each other."""
-    used = np.unique([order for order, _ in lines])
-    spacing = float(np.min(np.diff(np.concatenate([[0.0], used]))))
+    spacing = float(np.min(np.diff(np.concatenate([[0.0], orders]))))
     angle = rough.angle(rate, samples.shape[1])
     revolutions = max(int(np.ceil(2.0 / spacing)), 1,
                       int(np.ceil((angle[-1] - angle[0]) / _MOST_CELLS)))
@@ -142,7 +140,7 @@ def _phase(samples: FloatArray, rate: float, rough: Rough, lines: list[tuple[flo
         raise SignalError(f'{angle[-1] - angle[0]:.3g} revolutions: at least '
                           f'{_FEWEST_CELLS * revolutions} are needed to follow the phase; give a '
                           'longer recording')
-    return phase_of(samples, rate, angle, revolutions, lines)
+    return phase_of(samples, rate, angle, revolutions, orders)
 
 
 def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:

@@ -37,8 +37,8 @@ class ExpectedAmplitudes:
 
     `orders` are multiples of the tach shaft. `attenuation` (order,) is the mean, and
     `standard_deviation` (order,) that over averages, of the amplitude of a line that was not used
-    to find the pulses, over the true one. `factor` (channel, order) is the mean of what is
-    measured over what is true: a line that was `used` (channel, order) is too large, because its
+    to find the pulses, over the true one. `factor` (order,) is the mean of what is
+    measured over what is true: a line that was `used` (order,) is too large, because its
     own noise is aligned with itself.
     """
 
@@ -71,7 +71,7 @@ class FoundPulses:
 
     `times` (pulse,) in s, with `standard_errors` (pulse,) about an angle that is arbitrary but
     constant; `speed` (pulse,) in Hz with `speed_standard_errors`. `orders` are those of the comb;
-    `used` are the lines, (order, channel), whose phase was used. `reason` says why the pulses do
+    `used` are those of them whose phase was used. `reason` says why the pulses do
     not cover the recording, '' if they do. Errors of neighbouring pulses are alike: the jitter of
     single pulses says nothing of them, `covariance` does.
     """
@@ -81,9 +81,8 @@ class FoundPulses:
     speed: FloatArray
     speed_standard_errors: FloatArray
     orders: tuple[float, ...]
-    used: tuple[tuple[float, int], ...]
+    used: tuple[float, ...]
     reason: str
-    channels: int
     start_time: float
     _phase: Phase = field(repr=False)
     _rows: FloatArray = field(repr=False)
@@ -93,7 +92,7 @@ class FoundPulses:
 
     @classmethod
     def between(cls, phase: Phase, first: int, last: int, start: float, orders: FloatArray,
-                channels: int, reason: str) -> 'FoundPulses':
+                reason: str) -> 'FoundPulses':
         """Return the pulses between two nodes of a phase."""
         ends = phase.states[[first, last], 0]
         times = phase.times_of(np.arange(math.ceil(ends[0]), math.floor(ends[1]) + 1))
@@ -104,9 +103,8 @@ class FoundPulses:
         mean = phase.seen_by(place, rows, together)[:, 0]
         variance = phase.variance(place, rows) - 2.0 * mean + mean.mean()
         return cls(times + start, np.sqrt(np.maximum(variance, 0.0)) / speed, speed,
-                   np.sqrt(phase.variance(place, slopes)), tuple(orders.tolist()), tuple(zip(
-                       phase.cells.orders.tolist(), phase.cells.channels.tolist())), reason,
-                   channels, start, phase, rows, place)
+                   np.sqrt(phase.variance(place, slopes)), tuple(orders.tolist()),
+                   tuple(phase.cells.orders.tolist()), reason, start, phase, rows, place)
 
     def angle_covariance(self, first: int, count: int) -> FloatArray:
         """Return the covariance (pulse, pulse) in rad^2 of the angle at pulses in a row."""
@@ -158,9 +156,7 @@ class FoundPulses:
             square += (size**2).mean(axis=0) / windows
             within = np.trace(errors) / len(errors) - errors.mean()
             inside += wanted**2 * within / windows
-        used = np.zeros((self.channels, len(wanted)), bool)
-        for order, channel in self.used:
-            used[channel] |= np.abs(wanted - order) <= _SAME * order
+        used = np.isclose(wanted[:, None], self.used, rtol=_SAME, atol=0.0).any(axis=1)
         return ExpectedAmplitudes(
             wanted, mean, np.sqrt(np.maximum(square - mean**2, 0.0)),
             np.where(used, mean * np.exp(inside), mean), used)
@@ -196,8 +192,8 @@ class FoundPulses:
         errors = np.sqrt((average.noise / expected.factor) ** 2 + np.abs(amplitudes) ** 2 * (
             relative**2 + (0.5 * bias) ** 2))
         how = tuple('bias corrected: its own phase was used' if used else
-                    'free of bias: other lines or channels were used'
-                    for used in expected.used.any(axis=0))
+                    'free of bias: other orders were used'
+                    for used in expected.used)
         return CorrectedAmplitudes(amplitudes, errors, expected, how)
 
 

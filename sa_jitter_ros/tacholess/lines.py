@@ -10,7 +10,7 @@
 
 """Lines of the machine in short cells along an angle: complex amplitudes, and their noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ ComplexArray = NDArray[np.complex128]
 _PIECE = 1 << 19  # samples of a channel at a time, so that memory stays small
 _CAP = 4.0  # amplitude over noise beyond which a line has no more to say of the first phase
 _TURN = 0.6  # of the strongest order, between cells, within which the first phase is sought
+_SEEN = 0.5  # share of the cells in which a channel has samples, at least
 _USUAL = 0.25  # of it, beyond which a change is unlikely
 _OVERLAP = 4.0 / 3.0  # noise of tapered cells that overlap by half, over that of single ones
 NOISE_CELLS = 64  # over which noise is constant
@@ -37,60 +38,63 @@ class Cells:
     The taper of cell k is centred about `times[k]` (cell,) and is 0 at its neighbours. Over it the
     mean of the angle by which the lines were demodulated is `angle[k]` revolutions, and that of
     the time from `times[k]`, and of its square, is `moments` (cell, 2). NaN: samples are lacking.
-    `orders` (line,) and `channels` (line,) name the lines.
+    `orders` (line,) are those of the lines.
     """
 
     times: FloatArray
     angle: FloatArray
     moments: FloatArray
     orders: FloatArray
-    channels: NDArray[np.intp]
     values: ComplexArray
 
     def chosen(self, kept: NDArray[np.bool_]) -> 'Cells':
         """Return some of the lines."""
-        return Cells(self.times, self.angle, self.moments, self.orders[kept], self.channels[kept],
-                     self.values[kept])
+        return replace(self, orders=self.orders[kept], values=self.values[kept])
 
 
 def demodulated(vibration: FloatArray, sample_rate: float, angle: FloatArray, revolutions: int,
-                lines: list[tuple[float, int]]) -> Cells:
+                orders: FloatArray) -> Cells:
     """
-    Return lines, as (order, channel), in cells of so many revolutions.
+    Return orders of vibration (channel, sample), all channels together, in cells.
 
-    `angle` (sample,) in revolutions rises from sample to sample.
+    `angle` (sample,) in revolutions rises from sample to sample; a cell has `revolutions`.
     """
     first = np.ceil(angle[0] / revolutions)
     marks = revolutions * np.arange(first, np.floor(angle[-1] / revolutions) + 1)
     edges = np.searchsorted(angle, marks)
     times = np.interp(marks[1:-1], angle, np.arange(angle.size) / sample_rate)
-    by_order: dict[float, list[int]] = {}
-    for place, (order, _) in enumerate(lines):
-        by_order.setdefault(order, []).append(place)
     cells = len(marks) - 2
-    values = np.zeros((len(lines), cells), complex)
+    values = np.zeros((len(orders), len(vibration), cells), complex)
     mean, moments = np.zeros(cells), np.zeros((cells, 2))
     per_piece = max(int(_PIECE * cells / (edges[-1] - edges[0])), 4)
     for start in range(0, cells, per_piece):
-        stop = min(start + per_piece, cells)
-        inside = slice(edges[start], edges[stop + 1])
+        part = slice(start, min(start + per_piece, cells))
+        inside = slice(edges[start], edges[part.stop + 1])
         piece = angle[inside]
-        tapered = _Tapers(piece / revolutions - first - start, edges[start:stop + 1] - edges[start])
-        after = np.arange(inside.start, inside.stop) / sample_rate
-        here = times[start:stop]
-        when = tapered.means(after - here[0]) + here[0] - here
-        square = tapered.means((after - here[0]) ** 2)
-        moments[start:stop, 0] = when
-        moments[start:stop, 1] = square - 2.0 * (here - here[0]) * (when + here - here[0]) + (
-            here - here[0]) ** 2
-        mean[start:stop] = tapered.means(piece - piece[0]) + piece[0]
-        for order, places in by_order.items():
+        tapered = _Tapers(piece / revolutions - first - start,
+                          edges[start:part.stop + 1] - edges[start])
+        after = np.arange(inside.start, inside.stop) / sample_rate - times[start]
+        here = times[part] - times[start]
+        when = tapered.means(after)
+        moments[part, 0] = when - here
+        moments[part, 1] = tapered.means(after**2) - 2.0 * here * when + here**2
+        mean[part] = tapered.means(piece - piece[0]) + piece[0]
+        for order, found in zip(orders, values):
             turning = np.exp(-2j * np.pi * np.remainder(order * piece, 1.0))
-            for place in places:
-                values[place, start:stop] = 2.0 * tapered.means(
-                    vibration[lines[place][1], inside] * turning)
-    return Cells(times, mean, moments, np.array([order for order, _ in lines]),
-                 np.array([channel for _, channel in lines], np.intp), values)
+            for channel, samples in enumerate(vibration[:, inside]):
+                found[channel, part] = 2.0 * tapered.means(samples * turning)
+    return Cells(times, mean, moments, orders, np.array([_together(item) for item in values]))
+
+
+def _together(values: ComplexArray) -> ComplexArray:
+    """Return the sum (cell,) of the channels (channel, cell) of a line that stands out most."""
+    values = values[np.isfinite(values).mean(axis=1) > _SEEN]
+    if not len(values):
+        return np.full(values.shape[1], np.nan + 0j)
+    white = values / np.sqrt(noise_power(values))[:, :1]
+    known = white[:, np.isfinite(white).all(axis=0)]
+    _, vectors = np.linalg.eigh(known @ known.conj().T)
+    return np.asarray(vectors[:, -1].conj() @ white)
 
 
 class _Tapers:

@@ -30,7 +30,7 @@ _WHITE = 0.75  # of the variance of overlapping cells remains where their noise 
 _STRANGE = 25.0  # squared residual over its variance that no noise makes
 _FEWEST_BINS = 8  # over which the slow part of the noise is measured
 _MOST_STRANGE = 0.2  # share of such cells, beyond which the line is
-_WRONG = 5.0  # misfit of a line that is not tied to the shaft
+_WRONG = 50.0  # misfit of a line that is not tied to the shaft
 _LEAST = 40.0  # sum of the ratios of power of line and noise over cells, of a line that is there
 
 
@@ -134,20 +134,17 @@ class Phase:
 
 
 def phase_of(vibration: FloatArray, sample_rate: float, angle: FloatArray, revolutions: int,
-             lines: list[tuple[float, int]]) -> Phase | None:
-    """Return the phase by lines (order, channel) along a rough angle; None if none is there."""
+             orders: FloatArray) -> Phase | None:
+    """Return the phase by lines of some orders along a rough angle; None if none is there."""
     times = np.arange(angle.size) / sample_rate
     found = None
     for number in range(_PASSES):
-        cells = demodulated(vibration, sample_rate, angle, revolutions, lines)
-        found = _smoothed(cells, found)
-        if found is None:
+        found = _smoothed(demodulated(vibration, sample_rate, angle, revolutions, orders), found)
+        if found is None or number == _PASSES - 1:
+            break
+        orders, angle = found.cells.orders, found.angle(times)
+        if not np.all(np.diff(angle) > 0.0):
             return None
-        lines = list(zip(found.cells.orders.tolist(), found.cells.channels.tolist()))
-        if number < _PASSES - 1:
-            angle = found.angle(times)
-            if not np.all(np.diff(angle) > 0.0):
-                return None
     return found
 
 

@@ -65,7 +65,7 @@ class Tacholess:
 def summary(found: FoundPulses) -> str:
     """Return one line: what was found, how well, and what is arbitrary."""
     errors = 1e6 * float(np.median(found.standard_errors))
-    orders = ', '.join(f'{order:g}' for order in dict(found.used))
+    orders = ', '.join(f'{order:g}' for order in found.used)
     return (f'no tach: {len(found.times)} pulses from orders {orders}, at {found.speed.min():.5g} '
             f'to {found.speed.max():.5g} Hz, +- {errors:.3g} us; phase 0 is arbitrary'
             + (f'; {found.reason}' if found.reason else ''))
