@@ -27,7 +27,7 @@ _PRESENT = 0.3  # nats a frame, of an order whose phase is used
 _MOST_ORDERS = 12  # of which the phase is looked at
 _BAND = 0.45  # of the sampling rate, up to which lines are used
 _MOST_CELLS = 4000
-_FEWEST_CELLS = 24
+_FEWEST_CELLS = 16
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
 _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
 _COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
@@ -150,7 +150,7 @@ def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
     cells = np.diff(phase.seen.nodes) / phase.seen.unit
     surprise = np.sqrt(phase.walk.shaft * cells**5 / 20.0)  # of the angle, by a change of the jerk
     known = (step / (2.0 * np.pi) < _LOST) & (surprise < _SURPRISE)
-    known &= _agree(phase, rough)
+    known &= _agree(phase, rough) & np.isfinite(phase.cells.values).any(axis=0)
     known[[0, -1]] = False  # no cell beyond it
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     begins, ends = edges[::2], edges[1::2]
@@ -162,8 +162,8 @@ def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
     nodes = phase.seen.nodes + start
     lost = [f'{side} {nodes[k]:.4g} s' for side, k, end in (
         ('before', first, 1), ('after', last, len(known) - 1)) if k != end]
-    return first, last, (f'{" and ".join(lost)} the lines are too weak, or change too fast, to '
-                         'follow their phase' if lost else '')
+    return first, last, (f'{" and ".join(lost)} samples are lacking, or the lines are too weak or '
+                         'change too fast to follow their phase' if lost else '')
 
 
 def _agree(phase: Phase, rough: Rough) -> NDArray[np.bool_]:
