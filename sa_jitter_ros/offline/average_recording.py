@@ -43,6 +43,7 @@ FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 
+FOUND = 'found_pulses.npz'
 _VERSION = 3  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
@@ -266,6 +267,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
         row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
         row = replace(row, remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
         write_averages(folder, signals, series, {'settings': settings, 'row': asdict(row)})
+        if found is not None:
+            found.save(folder / FOUND)
         if job.figures:
             from sa_jitter_ros.offline.figures import write_figures
             write_figures(folder, signals, series, {

@@ -26,7 +26,8 @@ FloatArray = NDArray[np.float64]
 _FOREIGN = 0.05  # of all bins hold a peak of something else
 _ABSENT = 0.3  # of the time a line of the machine is not to be seen
 _HOPS = 4  # of frames in the length of one
-_NARROW, _WIDE = 12, 40  # bins over which the floor of the noise is taken, lowest and others
+_NARROW, _WIDE = 12, 40  # bins over which the floor of the noise is taken, below and above
+_LOW = 120  # this bin
 _SHARPNESS = 0.1  # nats for a power e times as large: the middle of a strong line wins
 _LARGEST = 600.0  # power over noise, beyond which the incomplete gamma function underflows
 
@@ -82,20 +83,12 @@ def spectra_of(vibration: FloatArray, sample_rate: float, seconds: float, highes
 def _floor(power: FloatArray) -> FloatArray:
     """Return the mean power (frame, bin) of the noise: medians over bins, lines left aside."""
     bins = power.shape[1]
-    edges = [1]
-    while edges[-1] < bins:
-        edges.append(edges[-1] + min(max(_NARROW, edges[-1] // 4), _WIDE))
-    if len(edges) > 2 and edges[-1] > bins:
-        edges.pop()
-    edges[-1] = bins
-    middles = np.array([0.5 * (a + b - 1) for a, b in zip(edges, edges[1:])])
-    floors = np.log(np.stack([np.median(power[:, a:b], axis=1) for a, b in zip(edges, edges[1:])]
-                             ) / np.log(2.0) + 1e-300)
-    place = np.clip(np.interp(np.arange(bins), middles, np.arange(len(middles))), 0, None)
-    low = np.minimum(place.astype(int), max(len(middles) - 2, 0))
-    share = (place - low)[:, None]
-    high = np.minimum(low + 1, len(middles) - 1)
-    return np.asarray(np.exp((1.0 - share) * floors[low] + share * floors[high]).T)
+    edges = np.concatenate([np.arange(1, min(_LOW, bins), _NARROW), np.arange(_LOW, bins, _WIDE)])
+    parts = np.split(np.arange(bins), edges)[1:]
+    middles = [part.mean() for part in parts]
+    medians = np.stack([np.median(power[:, part], axis=1) for part in parts], axis=1)
+    between = np.array([np.interp(np.arange(bins), middles, one) for one in np.eye(len(parts))])
+    return np.asarray(np.exp(np.log(medians / np.log(2.0) + 1e-300) @ between))
 
 
 def _evidence(surprise: FloatArray) -> FloatArray:

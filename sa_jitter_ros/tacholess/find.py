@@ -31,6 +31,7 @@ _FEWEST_CELLS = 16
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
 _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
 _COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
+_UNTIED = 2e-3  # rad^2 a cell of their own, of lines that are not of one shaft
 _SAME = 1e-6  # relative
 
 
@@ -81,6 +82,10 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     if phase is None:
         raise SignalError('no line is strong and steady enough to follow its phase: give other '
                           'orders, fewer in hold_out, or a sensor nearer to their source')
+    if phase.walk.own > _UNTIED:
+        raise SignalError(f'the orders {", ".join(f"{order:g}" for order in phase.cells.orders)} do '
+                          'not turn together, as those of one shaft do: give fewer of them, or '
+                          'another sensor')
     first, last, reason = _stretch(phase, rough, start)
     return FoundPulses.between(phase, first, last, start, wanted, reason)
 

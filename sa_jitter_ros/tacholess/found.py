@@ -13,6 +13,7 @@
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,7 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import numbers
 from sa_jitter_ros.tacholess.phase import Phase
+from scipy.sparse import csr_matrix
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -85,8 +87,7 @@ class FoundPulses:
     reason: str
     start_time: float
     _phase: Phase = field(repr=False)
-    _rows: FloatArray = field(repr=False)
-    _nodes: NDArray[np.intp] = field(repr=False)
+    _rows: csr_matrix = field(repr=False)
     _expected: dict[tuple[bytes, int], ExpectedAmplitudes] = field(
         init=False, repr=False, default_factory=dict)
 
@@ -96,20 +97,18 @@ class FoundPulses:
         """Return the pulses between two nodes of a phase."""
         ends = phase.states[[first, last], 0]
         times = phase.times_of(np.arange(math.ceil(ends[0]), math.floor(ends[1]) + 1))
-        place, rows, slopes = phase.rows(times)
-        speed = phase.speed(times)
+        rows, speed = phase.rows(times), phase.speed(times)
         # About the mean over all pulses: what they have in common is the arbitrary angle.
-        together = phase.right(place, rows, np.full((times.size, 1), 1.0 / times.size))
-        mean = phase.seen_by(place, rows, together)[:, 0]
-        variance = phase.variance(place, rows) - 2.0 * mean + mean.mean()
+        mean = rows @ phase.posterior.solved(np.asarray(rows.mean(axis=0)).reshape(-1, 1))[:, 0]
+        variance = phase.variance(rows) - 2.0 * mean + mean.mean()
         return cls(times + start, np.sqrt(np.maximum(variance, 0.0)) / speed, speed,
-                   np.sqrt(phase.variance(place, slopes)), tuple(orders.tolist()),
-                   tuple(phase.cells.orders.tolist()), reason, start, phase, rows, place)
+                   np.sqrt(phase.variance(phase.rows(times, speed=True))), tuple(orders.tolist()),
+                   tuple(phase.cells.orders.tolist()), reason, start, phase, rows)
 
     def angle_covariance(self, first: int, count: int) -> FloatArray:
         """Return the covariance (pulse, pulse) in rad^2 of the angle at pulses in a row."""
-        part = slice(first, first + count)
-        found = self._phase.covariance(self._nodes[part], self._rows[part])
+        rows = self._rows[first:first + count]
+        found = rows @ self._phase.posterior.solved(rows.T.toarray())
         return np.asarray((2.0 * math.pi) ** 2 * found)
 
     @cached_property
@@ -156,10 +155,16 @@ class FoundPulses:
             square += (size**2).mean(axis=0) / windows
             within = np.trace(errors) / len(errors) - errors.mean()
             inside += wanted**2 * within / windows
-        used = np.isclose(wanted[:, None], self.used, rtol=_SAME, atol=0.0).any(axis=1)
+        used = np.asarray(np.isclose(wanted[:, None], self.used, rtol=_SAME, atol=0.0).any(axis=1))
         return ExpectedAmplitudes(
             wanted, mean, np.sqrt(np.maximum(square - mean**2, 0.0)),
             np.where(used, mean * np.exp(inside), mean), used)
+
+    def save(self, path: Path) -> None:
+        """Write the pulses with their errors to a .npz file, with the names of a recording."""
+        np.savez(path, pulse_times=self.times, pulses_per_revolution=1,
+                 standard_errors=self.standard_errors, speed=self.speed,
+                 speed_standard_errors=self.speed_standard_errors, used_orders=self.used)
 
     def bridged(self, pulse_times: ArrayLike, pulses_per_revolution: int = 1) -> FloatArray:
         """

@@ -18,6 +18,7 @@ from sa_jitter_ros.tacholess.lines import Cells, demodulated, first_correction, 
 from sa_jitter_ros.tacholess.smoother import fitted, Posterior, Seen, Walk
 from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
+from scipy.sparse import csr_matrix
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -81,56 +82,36 @@ class Phase:
                             nodes[0], nodes[-1])
         return np.asarray(times)
 
-    def rows(self, times: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-        """
-        Return between which nodes times lie, and the factors of their states, as `angle` has it.
-
-        The node before (time,); factors (time, 2 nodes, angle and speed) in revolutions of the
-        angle, and in Hz of the speed.
-        """
+    def rows(self, times: FloatArray, *, speed: bool = False) -> csr_matrix:
+        """Return the factors (time, node x state) of the states in the angle, or in the speed."""
         nodes = self.seen.nodes
         place = np.clip(np.searchsorted(nodes, times, side='right') - 1, 0, len(nodes) - 2)
         step = nodes[place + 1] - nodes[place]
         u = (times - nodes[place]) / step
-        angle = np.array([[(1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2 * step],
-                          [u**2 * (3 - 2 * u), u**2 * (u - 1) * step]])
-        speed = np.array([[6 * u * (u - 1) / step, (1 - u) * (1 - 3 * u)],
-                          [6 * u * (1 - u) / step, u * (3 * u - 2)]])
-        scale = self.unit[:, None]
-        return (place.astype(np.intp), (angle * scale).transpose(2, 0, 1),
-                (speed * scale).transpose(2, 0, 1))
+        factors = np.array([
+            6 * u * (u - 1) / step, (1 - u) * (1 - 3 * u), 6 * u * (1 - u) / step, u * (3 * u - 2)
+        ] if speed else [
+            (1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2 * step, u**2 * (3 - 2 * u),
+            u**2 * (u - 1) * step])
+        width = self.posterior.mode.shape[1]
+        columns = (place * width)[:, None] + [0, 1, width, width + 1]
+        return csr_matrix(((factors.T * np.tile(self.unit, 2)).ravel(), columns.ravel(),
+                           np.arange(0, 4 * len(times) + 1, 4)),
+                          shape=(len(times), self.posterior.mode.size))
 
     def speed(self, times: FloatArray) -> FloatArray:
         """Return the speed (time,) in Hz between the nodes."""
-        place, _, factors = self.rows(times)
-        ends = np.stack([self.posterior.mode[place, :2], self.posterior.mode[place + 1, :2]], 1)
-        return np.asarray(np.sum(factors * ends, axis=(1, 2)))
+        return np.asarray(self.rows(times, speed=True) @ self.posterior.mode.ravel())
 
-    def variance(self, place: NDArray[np.intp], rows: FloatArray) -> FloatArray:
-        """Return the variance (time,) of what rows behind nodes see of the states."""
+    def variance(self, rows: csr_matrix) -> FloatArray:
+        """Return the variance (time,) of what rows (time, node x state) see."""
         width = self.posterior.mode.shape[1]
-        kept = np.array([0, 1, width, width + 1])
-        pairs = self.posterior.pairs[place][:, kept[:, None], kept]
-        flat = rows.reshape(len(rows), 4)
-        return np.asarray(np.einsum('ki,kij,kj->k', flat, pairs, flat))
-
-    def right(self, place: NDArray[np.intp], rows: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return the covariance of all states with sums, `weights` (time, sum), of what rows see."""
-        found = np.zeros((*self.posterior.mode.shape, weights.shape[1]))
-        for node in range(2):
-            for state in range(2):
-                np.add.at(found[:, state], place + node, rows[:, node, state, None] * weights)
-        return self.posterior.solved(found.reshape(-1, weights.shape[1]))
-
-    def seen_by(self, place: NDArray[np.intp], rows: FloatArray, states: FloatArray) -> FloatArray:
-        """Return what rows see (time, sum) of sums of states."""
-        each = states.reshape(*self.posterior.mode.shape, -1)
-        return np.asarray(sum(rows[:, node, state, None] * each[place + node, state]
-                              for node in range(2) for state in range(2)))
-
-    def covariance(self, place: NDArray[np.intp], rows: FloatArray) -> FloatArray:
-        """Return the covariance (time, time) of what rows see."""
-        return self.seen_by(place, rows, self.right(place, rows, np.eye(len(place))))
+        columns = rows.indices.reshape(-1, 4)
+        place = columns[:, 0] // width
+        inside = columns - (place * width)[:, None]
+        pairs = self.posterior.pairs[place[:, None, None], inside[:, :, None], inside[:, None]]
+        factors = rows.data.reshape(-1, 4)
+        return np.asarray(np.einsum('ki,kij,kj->k', factors, pairs, factors))
 
 
 def phase_of(vibration: FloatArray, sample_rate: float, angle: FloatArray, revolutions: int,

@@ -67,5 +67,6 @@ def summary(found: FoundPulses) -> str:
     errors = 1e6 * float(np.median(found.standard_errors))
     orders = ', '.join(f'{order:g}' for order in found.used)
     return (f'no tach: {len(found.times)} pulses from orders {orders}, at {found.speed.min():.5g} '
-            f'to {found.speed.max():.5g} Hz, +- {errors:.3g} us; phase 0 is arbitrary'
+            f'to {found.speed.max():.5g} Hz, +- {errors:.3g} us; phase 0 is arbitrary, and '
+            'the bias of these orders is corrected'
             + (f'; {found.reason}' if found.reason else ''))
