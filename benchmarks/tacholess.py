@@ -13,9 +13,9 @@ Pulses without a tach: errors over stated ones, coverage, refusals, wrong ones, 
 
 `python benchmarks/tacholess.py` prints the tables of docs/tacholess.md: machines drawn at random,
 measured recordings with their tach hidden (`--data`), and the speed. Machines of another simulator
-(`--simulator`, a file with `make(kind, effects, seed)` and `MACH`) are a set of their own, on which
-nothing was chosen. With rota-order installed its speed stands beside; `comb and spline` is the
-maximum of a comb in each spectrogram frame next to the one before, and a smoothing spline, as
+(`--simulator`, a file with `make(kind, effects, seed)` and `MACH`) are a set of their own, on
+which nothing was chosen. With rota-order installed its speed stands beside; `comb and spline` is
+the maximum of a comb in each spectrogram frame next to the one before, and a smoothing spline, as
 MATLAB's rpmtrack has it. Wrong is a speed off by 2 % in the median, or an angle off by more than
 half a turn of the highest order used.
 """
@@ -45,7 +45,7 @@ ORDERS = ([1, 2, 3, 4], [1, 2, 3, 5], [20, 40, 60], [17, 23, 34, 46, 51])
 
 @dataclass(frozen=True)
 class Case:
-    """A machine: vibration (channel, sample), its true `angle` in revolutions, what is declared."""
+    """A machine: vibration (channel, sample), true `angle` in revolutions, what is declared."""
 
     kind: str
     vibration: FloatArray
@@ -272,7 +272,8 @@ def summary(name: str, rows: list[Row]) -> list[str]:
         return f'{1e3 * np.median(known):.2g}' if known.size else '-'
 
     return [name, str(len(rows)), share([bool(row.refused) for row in rows]),
-            share([row.wrong for row in rows]), f'{100 * np.mean([r.covered for r in good]):.0f} %',
+            share([row.wrong for row in rows]),
+            f'{100 * np.mean([row.covered for row in good]):.0f} %',
             f'{100 * np.mean([row.covered_95 for row in good]):.0f} %',
             f'{np.median(ratio):.2f}', share([bool(row.reason) for row in good]),
             f'{100 * np.mean([row.share for row in good]):.0f} %',

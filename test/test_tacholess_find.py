@@ -52,7 +52,8 @@ def run_up():
 
 def test_pulses_of_a_run_up(run_up):
     _, angle, found = run_up
-    assert found.reason == '' and found.used == tuple(ORDERS)
+    assert found.reason == ''
+    assert found.used == tuple(ORDERS)
     assert found.times.size > 350
     stated = found.standard_errors * found.speed
     off = error(found, angle)
@@ -137,7 +138,8 @@ def test_gap_ends_the_pulses_and_a_dead_channel_costs_itself(run_up):
     broken[:, int(7.0 * RATE):int(7.2 * RATE)] = np.nan
     found = sa.find_pulses(broken, RATE, orders=ORDERS, speed_range=RANGE, start_time=100.0)
     assert found.reason.startswith('before 107.')
-    assert 107.0 < found.times[0] < 108.0 and found.times[-1] > 119.8
+    assert 107.0 < found.times[0] < 108.0
+    assert found.times[-1] > 119.8
     assert np.abs(error(replace(found, times=found.times - 100.0), angle)).max() < 0.005
 
 

@@ -141,8 +141,8 @@ def add_tacholess_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for recordings without a tach, or whose tach was lost for a while."""
     group = parser.add_argument_group('without a tach')
     group.add_argument('--tacholess', type=float, nargs=2, metavar=('LOW', 'HIGH'),
-                       help='find the pulses in the vibration: speed of the tach shaft between LOW '
-                       'and HIGH, Hz')
+                       help='find the pulses in the vibration: speed of the tach shaft between '
+                       'LOW and HIGH, Hz')
     group.add_argument('--comb', type=float, nargs='+', default=(), metavar='ORDER',
                        help='orders of the tach shaft at which the machine has lines (default: '
                        'those of the machine, or of the recording)')
@@ -154,7 +154,8 @@ def tacholess_options(options: argparse.Namespace) -> Tacholess | None:
     """Return how pulses are found, None where they are those of the tach."""
     if options.tacholess is None:
         if options.comb or options.bridge_tach:
-            raise ParameterError('--comb and --bridge-tach belong to --tacholess LOW HIGH: give it')
+            raise ParameterError('--comb and --bridge-tach belong to --tacholess LOW HIGH: give '
+                                 'it')
         return None
     return Tacholess(tuple(options.tacholess), tuple(options.comb), options.bridge_tach)
 

@@ -83,9 +83,9 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
         raise SignalError('no line is strong and steady enough to follow its phase: give other '
                           'orders, fewer in hold_out, or a sensor nearer to their source')
     if phase.walk.own > _UNTIED:
-        raise SignalError(f'the orders {", ".join(f"{order:g}" for order in phase.cells.orders)} do '
-                          'not turn together, as those of one shaft do: give fewer of them, or '
-                          'another sensor')
+        together = ', '.join(f'{order:g}' for order in phase.cells.orders)
+        raise SignalError(f'the orders {together} do not turn together, as those of one shaft '
+                          'do: give fewer of them, or another sensor')
     first, last, reason = _stretch(phase, rough, start)
     return FoundPulses.between(phase, first, last, start, wanted, reason)
 
@@ -124,8 +124,8 @@ def _range(speed_range: Sequence[float], rate: float, orders: FloatArray) -> tup
     """Return the lowest and highest speed; raises ParameterError."""
     found = numbers('speed_range', speed_range)
     if len(found) != 2 or not np.all(np.isfinite(found)) or not 0.0 < found[0] < found[1]:
-        raise ParameterError(f'speed_range is {[*found]}: give (lowest, highest) speed in Hz, both '
-                             'above 0, the lowest first')
+        raise ParameterError(f'speed_range is {[*found]}: give (lowest, highest) speed in Hz, '
+                             'both above 0, the lowest first')
     if orders[0] * found[1] > _BAND * rate:
         raise ParameterError(
             f'speed_range goes to {found[1]:g} Hz, where the lowest order {orders[0]:g} is at '

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.tacholess.lines import Cells, demodulated, first_correction, noise_power
-from sa_jitter_ros.tacholess.smoother import fitted, Posterior, Seen, Walk
+from sa_jitter_ros.tacholess.smoother import fitted, Posterior, Seen, STARTS, Walk
 from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.sparse import csr_matrix
@@ -40,8 +40,9 @@ class Phase:
     """
     The angle of the shaft from cell to cell.
 
-    `posterior` has it in rad of the order `highest`, from `first` revolutions; `lines` (line,) of
-    `cells` were used, which show what is `seen`; `misfit` (line,) is the variance of residuals over that of the noise.
+    `posterior` has it in rad of the order `highest`, from `first` revolutions; the lines of
+    `cells` were used, which show what is `seen`; `misfit` (line,) is the variance of residuals
+    over that of the noise.
     """
 
     cells: Cells
@@ -134,15 +135,14 @@ def _smoothed(cells: Cells, before: Phase | None) -> Phase | None:
     if not len(cells.orders):
         return None
     correction = first_correction(cells) if before is None else np.zeros(len(cells.times))
-    widths = _WIDTHS if before is None else _WIDTHS[-1:]
-    walk = None if before is None else before.walk
-    for width in widths:
+    starts = STARTS if before is None else [before.walk]
+    for width in _WIDTHS if before is None else _WIDTHS[-1:]:
         seen, kept = _seen(cells, correction, width, trusted=before is not None)
         cells = cells.chosen(kept)
         if not len(cells.orders):
             return None
-        walk, posterior = fitted(seen, walk)
-        highest = float(cells.orders.max())
+        walk, posterior = fitted(seen, starts)
+        starts, highest = [walk], float(cells.orders.max())
         ends = np.stack([posterior.mode[:-1, :2], posterior.mode[1:, :2]], axis=1)
         mean = np.sum(ends * seen.taper, axis=(1, 2))
         correction = mean / (2.0 * np.pi * highest) - (cells.angle - cells.angle[0])

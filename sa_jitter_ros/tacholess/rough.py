@@ -151,8 +151,8 @@ def _require_most(found: Rough, orders: FloatArray) -> None:
     present = np.count_nonzero(found.evidence > _PRESENT)
     if 2 * present <= len(orders):
         raise SignalError(f'only {present} of the orders {_text(orders)} stand out at '
-                          f'{np.median(found.speed):.4g} Hz, which may be a guess: give those that '
-                          'the vibration has')
+                          f'{np.median(found.speed):.4g} Hz, which may be a guess: give those '
+                          'that the vibration has')
 
 
 def _text(orders: FloatArray) -> str:

@@ -11,13 +11,14 @@
 """
 Phase of a shaft from its lines: a linear Gaussian Markov model, solved for all cells at once.
 
-States of a cell: angle, speed, acceleration of the shaft, and so on, and the own phase of every
-line. The last derivative and the own phases are random walks. A line observes its order times the mean of the
-angle over the taper of a cell, plus its own phase. The precision of the states is
-block-tridiagonal: one banded Cholesky factor gives mode, covariances and marginal likelihood, by
-which the sizes of the random walks are chosen.
+States stand at nodes, before and after each cell: angle, speed and acceleration of the shaft, and
+the own phase of every line. The acceleration and the own phases are random walks. In a cell a line
+observes its order times the mean of the angle over the taper, plus its own phase. The precision of
+the states is block-tridiagonal: one banded Cholesky factor gives mode, covariances and marginal
+likelihood, by which the sizes of the random walks are chosen.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
@@ -34,7 +35,6 @@ _WIDE = (1e-3, 1e4, 1e3)  # standard deviations of them at the first node, rad, 
 _WIDE_PHASE = 10.0  # rad, of the own phase of a line at the first node
 _UNSCALED = np.linalg.inv([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]])
 _RANGE = np.log([[1e-12, 1e4], [1e-9, 1e-1]])  # of the sizes of walks
-_STARTS = np.log([[1e-1, 1e-6], [1e-4, 1e-6], [1e-7, 1e-6]])
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,14 @@ class Walk:
     """
     Sizes of the random walks, as variances a cell of mean length.
 
-    `shaft` of its acceleration, in rad^2 of the highest order; `own` of the phase of a line, rad^2.
+    `shaft` of its acceleration, in rad^2 of the highest order, `own` of the phase of a line.
     """
 
     shaft: float
     own: float
+
+
+STARTS = (Walk(1e-1, 1e-6), Walk(1e-4, 1e-6), Walk(1e-7, 1e-6))
 
 
 @dataclass(frozen=True)
@@ -194,8 +197,8 @@ class _Prior:
         return 0.5 * float(size - square)
 
 
-def fitted(seen: Seen, start: Walk | None = None) -> tuple[Walk, Posterior]:
-    """Return the walk with the most evidence, sought beside a `start`, and the states with it."""
+def fitted(seen: Seen, starts: Sequence[Walk]) -> tuple[Walk, Posterior]:
+    """Return the walk with the most evidence, sought beside one of `starts`, and its states."""
     def walk_of(sizes: FloatArray) -> Walk:
         return Walk(*np.exp(np.clip(sizes, *_RANGE.T)).tolist())
 
@@ -206,8 +209,7 @@ def fitted(seen: Seen, start: Walk | None = None) -> tuple[Walk, Posterior]:
             return 1e12
         return -evidence + 10.0 * float(np.sum((sizes - np.clip(sizes, *_RANGE.T)) ** 2))
 
-    starts = _STARTS if start is None else np.log([[start.shaft, start.own]])
-    begin = min(starts, key=loss)
+    begin = min((np.log([walk.shaft, walk.own]) for walk in starts), key=loss)
     walk = walk_of(minimize(loss, begin, method='Nelder-Mead', options={
         'initial_simplex': begin + np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]]),
         'xatol': 0.1, 'fatol': 0.1, 'maxfev': 40}).x)
