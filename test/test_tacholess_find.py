@@ -135,12 +135,23 @@ def test_attenuation_of_small_errors_is_that_of_their_variance(run_up):
 def test_gap_ends_the_pulses_and_a_dead_channel_costs_itself(run_up):
     vibration, angle, _ = run_up
     broken = np.vstack([vibration, np.full((1, vibration.shape[1]), np.nan)])
-    broken[:, int(7.0 * RATE):int(7.2 * RATE)] = np.nan
+    broken[:, int(7.0 * RATE):int(7.2 * RATE)] = np.inf
+    broken[1, int(12.0 * RATE):] = np.nan  # one channel less from here
     found = sa.find_pulses(broken, RATE, orders=ORDERS, speed_range=RANGE, start_time=100.0)
-    assert found.reason.startswith('before 107.')
-    assert 107.0 < found.times[0] < 108.0
+    assert found.reason == 'outside 107.2 to 120 s samples are lacking'
+    assert 107.2 < found.times[0] < 107.5
     assert found.times[-1] > 119.8
     assert np.abs(error(replace(found, times=found.times - 100.0), angle)).max() < 0.005
+
+
+def test_few_lost_samples_cost_nothing(run_up):
+    vibration, angle, whole = run_up
+    broken = vibration.copy()
+    broken[:, 30_000:30_020] = np.nan
+    found = sa.find_pulses(broken, RATE, orders=ORDERS, speed_range=RANGE)
+    assert found.reason == ''
+    assert found.times.size == whole.times.size
+    assert np.abs(error(found, angle)).max() < 0.005
 
 
 def test_tach_that_was_lost_is_bridged(run_up):

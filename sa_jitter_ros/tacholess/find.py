@@ -26,7 +26,7 @@ FloatArray = NDArray[np.float64]
 _PRESENT = 0.3  # nats a frame, of an order whose phase is used
 _MOST_ORDERS = 12  # of which the phase is looked at
 _BAND = 0.45  # of the sampling rate, up to which lines are used
-_MOST_CELLS = 4000
+_MOST_CELLS = 20_000
 _FEWEST_CELLS = 16
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
 _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
@@ -72,6 +72,10 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     low, high = _range(speed_range, rate, wanted)
     if not (np.isfinite(maximum_rate) and maximum_rate > 0.0):
         raise ParameterError(f'maximum_rate is {maximum_rate} per s: give a positive one')
+    begin, end = _longest(np.isfinite(samples).any(axis=0), int(rate / high))
+    lacking = '' if end - begin == samples.shape[1] else (
+        f'outside {start + begin / rate:.4g} to {start + end / rate:.4g} s samples are lacking')
+    samples, start = samples[:, begin:end], start + begin / rate
     rough = rough_speed(samples, rate, wanted, (low, high), maximum_rate)
     kept = np.array([not np.any(np.abs(np.asarray([*hold_out]) - order) <= _SAME * order)
                      for order in wanted])
@@ -87,7 +91,8 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
         raise SignalError(f'the orders {together} do not turn together, as those of one shaft '
                           'do: give fewer of them, or another sensor')
     first, last, reason = _stretch(phase, rough, start)
-    return FoundPulses.between(phase, first, last, start, wanted, reason)
+    return FoundPulses.between(phase, first, last, start, wanted, '; '.join(
+        filter(None, [lacking, reason])))
 
 
 def _checked(vibration: ArrayLike) -> FloatArray:
@@ -100,7 +105,18 @@ def _checked(vibration: ArrayLike) -> FloatArray:
     if samples.shape[0] > samples.shape[1]:
         raise SignalError(f'vibration has {samples.shape[0]} channels of {samples.shape[1]} '
                           'samples: give (channel, sample), transpose it')
-    return samples.astype(np.float64)
+    return np.where(np.isfinite(samples), samples, np.nan).astype(np.float64)
+
+
+def _longest(present: NDArray[np.bool_], gap: int) -> tuple[int, int]:
+    """Return begin and end of the most samples (sample,) without a gap of more than `gap`."""
+    known = np.flatnonzero(present)
+    if not known.size:
+        raise SignalError('vibration has no finite sample: give another recording')
+    cuts = np.flatnonzero(np.diff(known) > gap)
+    begins, ends = known[np.r_[0, cuts + 1]], known[np.r_[cuts, known.size - 1]] + 1
+    longest = int(np.argmax(ends - begins))
+    return int(begins[longest]), int(ends[longest])
 
 
 def _orders(orders: Sequence[float] | None, machine: Machine | None) -> FloatArray:
@@ -155,7 +171,7 @@ def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
     cells = np.diff(phase.seen.nodes) / phase.seen.unit
     surprise = np.sqrt(phase.walk.shaft * cells**5 / 20.0)  # of the angle, by a change of the jerk
     known = (step / (2.0 * np.pi) < _LOST) & (surprise < _SURPRISE)
-    known &= _agree(phase, rough) & np.isfinite(phase.cells.values).any(axis=0)
+    known &= _agree(phase, rough)
     known[[0, -1]] = False  # no cell beyond it
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     begins, ends = edges[::2], edges[1::2]
@@ -167,8 +183,8 @@ def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
     nodes = phase.seen.nodes + start
     lost = [f'{side} {nodes[k]:.4g} s' for side, k, end in (
         ('before', first, 1), ('after', last, len(known) - 1)) if k != end]
-    return first, last, (f'{" and ".join(lost)} samples are lacking, or the lines are too weak or '
-                         'change too fast to follow their phase' if lost else '')
+    return first, last, (f'{" and ".join(lost)} the lines are too weak, or change too fast, to '
+                         'follow their phase' if lost else '')
 
 
 def _agree(phase: Phase, rough: Rough) -> NDArray[np.bool_]:

@@ -114,7 +114,7 @@ class FoundPulses:
     @cached_property
     def covariance(self) -> FloatArray:
         """
-        Return the covariance (pulse, pulse) of the times in s^2, about the arbitrary angle.
+        Return covariances (pulse, pulse) of the times in s^2, about the arbitrary angle.
 
         Raises ParameterError for more than 6000 pulses: `angle_covariance` gives parts of it.
         """

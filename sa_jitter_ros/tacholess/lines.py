@@ -12,6 +12,7 @@
 
 from dataclasses import dataclass, replace
 from typing import Any
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,10 +92,10 @@ def _together(values: ComplexArray) -> ComplexArray:
     values = values[np.isfinite(values).mean(axis=1) > _SEEN]
     if not len(values):
         return np.full(values.shape[1], np.nan + 0j)
-    white = values / np.sqrt(noise_power(values))[:, :1]
-    known = white[:, np.isfinite(white).all(axis=0)]
+    white = values / np.sqrt(np.median(noise_power(values), axis=1, keepdims=True))
+    known = np.nan_to_num(white)
     _, vectors = np.linalg.eigh(known @ known.conj().T)
-    return np.asarray(vectors[:, -1].conj() @ white)
+    return np.where(np.isfinite(white).any(axis=0), vectors[:, -1].conj() @ known, np.nan)
 
 
 class _Tapers:
@@ -111,7 +112,7 @@ class _Tapers:
         return np.asarray(up[:-1] + (whole - up)[1:])
 
     def means(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the weighted means (cell,) of values (sample,)."""
+        """Return for each cell the weighted mean of values (sample,)."""
         return np.asarray(self._sums(values) / self._weight)
 
 
@@ -124,9 +125,9 @@ def noise_power(values: ComplexArray) -> FloatArray:
     change = np.abs(values[:, 2:] - values[:, :-2]) ** 2 / (2.0 * np.log(2.0))
     count = max(change.shape[1] // NOISE_CELLS, 1)
     parts = np.array_split(np.arange(change.shape[1]), count)
-    with np.errstate(invalid='ignore'):
-        levels = np.array([np.nanmedian(change[:, part], axis=1) if np.isfinite(
-            change[:, part]).any() else np.full(len(values), np.nan) for part in parts])
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', RuntimeWarning)  # of parts without a sample
+        levels = np.array([np.nanmedian(change[:, part], axis=1) for part in parts])
     middles = [part.mean() + 1.0 for part in parts]
     cells = np.arange(values.shape[1])
     found = np.empty(values.shape)

@@ -65,7 +65,7 @@ class Phase:
         return np.asarray(self.posterior.mode[:, :2] * self.unit + [self.first, 0.0])
 
     def angle(self, times: FloatArray) -> FloatArray:
-        """Return the angle (time,) in revolutions; beyond the nodes it goes on as it was."""
+        """Return angles (time,) in revolutions; beyond the nodes it goes on as it was."""
         nodes, states = self.seen.nodes, self.states
         found = CubicHermiteSpline(nodes, states[:, 0], states[:, 1])(times)
         bends = np.diff(states[:, 1]) / np.diff(nodes)
@@ -101,11 +101,11 @@ class Phase:
                           shape=(len(times), self.posterior.mode.size))
 
     def speed(self, times: FloatArray) -> FloatArray:
-        """Return the speed (time,) in Hz between the nodes."""
+        """Return speeds (time,) in Hz between the nodes."""
         return np.asarray(self.rows(times, speed=True) @ self.posterior.mode.ravel())
 
     def variance(self, rows: csr_matrix) -> FloatArray:
-        """Return the variance (time,) of what rows (time, node x state) see."""
+        """Return variances (time,) of what rows (time, node x state) see."""
         width = self.posterior.mode.shape[1]
         columns = rows.indices.reshape(-1, 4)
         place = columns[:, 0] // width

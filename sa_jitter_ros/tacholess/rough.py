@@ -43,7 +43,7 @@ class Rough:
     evidence: FloatArray
 
     def angle(self, sample_rate: float, samples: int) -> FloatArray:
-        """Return the angle (sample,) in revolutions; speeds go on at the ends as they changed."""
+        """Return angles (sample,) in revolutions; speeds go on at the ends as they changed."""
         level = np.log(self.speed)
         times = np.concatenate([[0.0], self.times, [samples / sample_rate]])
         ends = [level[k] + (level[k] - level[k + by]) * abs(
