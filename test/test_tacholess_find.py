@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes
-from sa_jitter_ros.tacholess.smoother import Posterior, Seen, Walk
+from sa_jitter_ros.tacholess.smoother import MEMORY, Posterior, Seen, Walk
 from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
 from scipy.stats import chi2
 
 RATE = 4096.0
@@ -212,48 +213,72 @@ def test_orders_follow_from_the_machine():
     assert np.abs(error(found, angle)).max() < 0.005
 
 
+def transition(step, drift, spread):
+    """Return transition and covariance over a step of dx = drift x dt + noise, by Van Loan."""
+    size = len(drift)
+    both = expm(step * np.block([[-drift, spread], [np.zeros((size, size)), drift.T]]))
+    move = both[size:, size:].T
+    return move, move @ both[:size, size:]
+
+
+def dense_covariance(steps, walk):
+    """Return the covariance (node, state, node, state) of a shaft and two lines before data."""
+    drift, spread = np.zeros((2, 7, 7))
+    drift[[0, 1], [1, 2]], spread[2, 2] = 1.0, walk.shaft
+    for place in (3, 5):
+        drift[place, place + 1], drift[place + 1, place + 1] = 1.0, -1.0 / MEMORY
+        spread[place + 1, place + 1] = 2.0 * walk.own**2 / MEMORY
+    count = len(steps) + 1
+    found = np.zeros((count, 7, count, 7))
+    found[0, :, 0] = np.diag(np.array([1e-3, 1e4, 1e3, 10.0, walk.own, 10.0, walk.own]) ** 2)
+    for k, step in enumerate(steps):
+        move, new = transition(step, drift, spread)
+        for before in range(k + 1):
+            found[k + 1, :, before] = move @ found[k, :, before]
+            found[before, :, k + 1] = found[k + 1, :, before].T
+        found[k + 1, :, k + 1] = move @ found[k, :, k] @ move.T + new
+    return found.reshape(7 * count, 7 * count)
+
+
 def test_states_are_those_of_the_dense_model():
-    """Mode, covariance and evidence against matrices that hold all states at once."""
+    """Mode and evidence against matrices that hold all states at once."""
     rng = np.random.default_rng(4)
     times = np.cumsum(rng.uniform(0.8, 1.2, 7))
     moments = np.column_stack([0.01 * rng.standard_normal(7), np.full(7, 0.13)])
     seen = Seen(times, moments, np.array([0.5, 1.0]), rng.standard_normal((2, 7)),
                 rng.uniform(5.0, 20.0, (2, 7)), np.zeros((2, 7)))
+    rows = np.zeros((7, 2, 8, 7))
+    for k in range(7):
+        rows[k, :, k:k + 2] = seen.rows[k].reshape(2, 2, 7)
+    rows = rows.reshape(14, 56)
+    values = seen.phase.T.ravel()
     evidence, dense = [], []
     for walk in (Walk(0.3, 0.02), Walk(0.05, 0.2)):
         found = Posterior(seen, walk)
-        steps = np.diff(seen.nodes) / seen.unit
-        cov = np.zeros((8, 5, 8, 5))
-        first = np.array([1e-3, 1e4, 1e3, 10.0, 10.0]) ** 2
-        now = np.diag(first)
-        moves = []
-        cov[0, :, 0] = now
-        for k, step in enumerate(steps):
-            move = np.eye(5)
-            move[[0, 1], [1, 2]], move[0, 2] = step, 0.5 * step**2
-            new = np.zeros((5, 5))
-            for i in range(3):
-                for j in range(3):
-                    power = 5 - i - j
-                    new[i, j] = walk.shaft * step**power / (
-                        power * [2.0, 1.0, 1.0][i] * [2.0, 1.0, 1.0][j])
-            new[[3, 4], [3, 4]] = walk.own * step
-            moves.append(move)
-            for before in range(k + 1):
-                cov[k + 1, :, before] = move @ cov[k, :, before]
-                cov[before, :, k + 1] = cov[k + 1, :, before].T
-            cov[k + 1, :, k + 1] = move @ cov[k, :, k] @ move.T + new
-        rows = np.zeros((7, 2, 8, 5))
-        for k in range(7):
-            rows[k, :, k:k + 2] = seen.rows[k].reshape(2, 2, 5)
-        rows, cov = rows.reshape(14, 40), cov.reshape(40, 40)
-        noise = np.diag(1.0 / seen.precision.T.ravel())
-        marginal = rows @ cov @ rows.T + noise
-        values = seen.phase.T.ravel()
-        gain = np.linalg.solve(marginal, rows @ cov).T
-        np.testing.assert_allclose(seen.rows[3] @ np.r_[found.mode[3], found.mode[4]],
-                                   (rows @ gain @ values).reshape(7, 2)[3], rtol=1e-4, atol=1e-4)
+        prior = dense_covariance(np.diff(seen.nodes) / seen.unit, walk)
+        marginal = rows @ prior @ rows.T + np.diag(1.0 / seen.precision.T.ravel())
+        mode = prior @ rows.T @ np.linalg.solve(marginal, values)
+        np.testing.assert_allclose(rows @ found.mode.ravel(), rows @ mode, rtol=1e-4, atol=1e-4)
         evidence.append(found.evidence)
         dense.append(-0.5 * np.linalg.slogdet(marginal)[1]
                      - 0.5 * values @ np.linalg.solve(marginal, values))
     assert evidence[1] - evidence[0] == pytest.approx(dense[1] - dense[0], abs=0.02)
+
+
+def test_run_up_through_resonances_is_covered():
+    """Each line turns by pi where it passes a resonance, and the errors stated are as large."""
+    ratios = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        speed = np.linspace(13.0, 23.0, int(20.0 * RATE))
+        turns = np.cumsum(speed) / RATE
+        vibration = 0.5 * rng.standard_normal((1, speed.size))
+        for order in ORDERS:
+            place = order * rng.uniform(15.0, 21.0)
+            gain = 0.08 / (1.0 - (order * speed / place) ** 2 + 0.08j * order * speed / place)
+            vibration += 2.0 * np.real(gain * np.exp(2j * np.pi * order * turns))
+        found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 29.0))
+        off = error(found, lambda at, turns=turns: np.interp(
+            at, np.arange(turns.size) / RATE, turns))
+        ratios.append(off.std() / np.sqrt(np.mean((found.standard_errors * found.speed) ** 2)))
+    assert 0.3 < np.median(ratios) < 2.0

@@ -31,7 +31,7 @@ _FEWEST_CELLS = 16
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
 _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
 _COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
-_UNTIED = 2e-3  # rad^2 a cell of their own, of lines that are not of one shaft
+_UNTIED = 0.15  # rad a cell of their own, of lines that are not of one shaft
 _SAME = 1e-6  # relative
 
 

@@ -11,11 +11,11 @@
 """
 Phase of a shaft from its lines: a linear Gaussian Markov model, solved for all cells at once.
 
-States stand at nodes, before and after each cell: angle, speed and acceleration of the shaft, and
-the own phase of every line. The acceleration and the own phases are random walks. In a cell a line
-observes its order times the mean of the angle over the taper, plus its own phase. The precision of
-the states is block-tridiagonal: one banded Cholesky factor gives mode, covariances and marginal
-likelihood, by which the sizes of the random walks are chosen.
+States stand at nodes, before and after each cell: angle, speed and acceleration of the shaft, a
+random walk, and for every line a phase of its own and its rate, which wanders: resonances turn it
+smoothly. In a cell a line observes its order times the mean of the angle over the taper, plus its
+own phase. The precision of the states is block-tridiagonal: one banded Cholesky factor gives mode,
+covariances and marginal likelihood, by which the sizes of the random walks are chosen.
 """
 
 from collections.abc import Sequence
@@ -30,26 +30,28 @@ from scipy.optimize import minimize
 
 FloatArray = NDArray[np.float64]
 
-_SHAFT = 3  # states of the shaft
+_SHAFT, _OWN = 3, 2  # states of the shaft, and of a line
+MEMORY = 50.0  # cells that the rate of the phase of a line lasts: about a resonance
 _WIDE = (1e-3, 1e4, 1e3)  # standard deviations of them at the first node, rad, rad/cell, ...
 _WIDE_PHASE = 10.0  # rad, of the own phase of a line at the first node
 _UNSCALED = np.linalg.inv([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]])
-_RANGE = np.log([[1e-12, 1e4], [1e-9, 1e-1]])  # of the sizes of walks
+_RANGE = np.log([[1e-12, 1e4], [1e-7, 1.0]])  # of the sizes of walks
 
 
 @dataclass(frozen=True)
 class Walk:
     """
-    Sizes of the random walks, as variances a cell of mean length.
+    Sizes of the random walks.
 
-    `shaft` of its acceleration, in rad^2 of the highest order, `own` of the phase of a line.
+    `shaft`: variance of the acceleration a cell, in rad^2 of the highest order; `own`: standard
+    deviation of the rate of the own phase of a line, rad a cell.
     """
 
     shaft: float
     own: float
 
 
-STARTS = (Walk(1e-1, 1e-6), Walk(1e-4, 1e-6), Walk(1e-7, 1e-6))
+STARTS = tuple(Walk(shaft, own) for shaft in (1e-1, 1e-4, 1e-7) for own in (1e-5, 1e-2))
 
 
 @dataclass(frozen=True)
@@ -97,10 +99,10 @@ class Seen:
     def rows(self) -> FloatArray:
         """Return what each line sees (cell, line, 2 nodes x state) of the states."""
         lines = len(self.orders)
-        found = np.zeros((len(self.times), lines, 2, _SHAFT + (lines if lines > 1 else 0)))
+        found = np.zeros((len(self.times), lines, 2, _SHAFT + (_OWN * lines if lines > 1 else 0)))
         found[..., :2] = self.taper[:, None] * self.orders[:, None, None]
         if lines > 1:
-            found[:, :, 1, _SHAFT:] = np.eye(lines)
+            found[:, :, 1, _SHAFT::_OWN] = np.eye(lines)
         return found.reshape(*found.shape[:2], -1)
 
 
@@ -165,36 +167,49 @@ class _Prior:
     """Precision of the states before data: diagonal and below it; steps in units of a cell."""
 
     def __init__(self, steps: FloatArray, width: int, walk: Walk) -> None:
-        shaft, own = slice(0, _SHAFT), slice(_SHAFT, width)
-        down = [[j - i for j in range(_SHAFT)] for i in range(_SHAFT)]
-        kept = np.array([[steps**k / factorial(k) if k >= 0 else 0.0 * steps for k in row]
-                         for row in down]).transpose(2, 0, 1)
-        # Inverse of the covariance of what integrals of white noise add, for a step and scaled.
-        up = np.array([[5 - i - j for j in range(_SHAFT)] for i in range(_SHAFT)])
-        inverse = _UNSCALED / (walk.shaft * steps[:, None, None] ** up)
-        self._kept, self._inverse, self._own = kept, inverse, 1.0 / (walk.own * steps)
-        self._first = np.array([*_WIDE, *[_WIDE_PHASE] * (width - _SHAFT)])
+        lines = (width - _SHAFT) // _OWN
+        self._parts = [(slice(0, _SHAFT), *_jerk(steps, walk.shaft), np.array(_WIDE))]
+        self._parts += [(slice(first, first + _OWN), *_wander(steps, walk.own),
+                         np.array([_WIDE_PHASE, walk.own]))
+                        for first in range(_SHAFT, _SHAFT + _OWN * lines, _OWN)]
         self.diagonal = np.zeros((len(steps) + 1, width, width))
         self.below = np.zeros((len(steps), width, width))
-        moved = inverse @ kept
-        self.diagonal[:-1, shaft, shaft] += kept.transpose(0, 2, 1) @ moved
-        self.diagonal[1:, shaft, shaft] += inverse
-        self.below[:, shaft, shaft] -= moved
-        change = self._own[:, None, None] * np.eye(width - _SHAFT)
-        self.diagonal[:-1, own, own] += change
-        self.diagonal[1:, own, own] += change
-        self.below[:, own, own] -= change
-        self.diagonal[0] += np.diag(self._first**-2.0)
+        for place, kept, inverse, first in self._parts:
+            moved = inverse @ kept
+            self.diagonal[:-1, place, place] += kept.transpose(0, 2, 1) @ moved
+            self.diagonal[1:, place, place] += inverse
+            self.diagonal[0, place, place] += np.diag(first**-2.0)
+            self.below[:, place, place] -= moved
 
     def evidence(self, states: FloatArray) -> float:
         """Return the logarithm of the density of states (node, state), without constants."""
-        shaft, own = states[:, :_SHAFT], np.diff(states[:, _SHAFT:], axis=0)
-        new = shaft[1:] - np.einsum('kij,kj->ki', self._kept, shaft[:-1])
-        square = (np.einsum('ki,kij,kj', new, self._inverse, new)
-                  + np.sum(self._own[:, None] * own**2) + np.sum((states[0] / self._first) ** 2))
-        size = _SHAFT * len(new) * np.log(self._inverse[0, 0, 0]) + own.shape[1] * np.sum(
-            np.log(self._own))
-        return 0.5 * float(size - square)
+        found = 0.0
+        for place, kept, inverse, first in self._parts:
+            part = states[:, place]
+            new = part[1:] - np.einsum('kij,kj->ki', kept, part[:-1])
+            found += 0.5 * float(np.sum(np.linalg.slogdet(inverse)[1]) - np.einsum(
+                'ki,kij,kj', new, inverse, new) - np.sum((part[0] / first) ** 2))
+            found -= float(np.sum(np.log(first)))
+        return found
+
+
+def _jerk(steps: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return the transition (step, 3, 3) of a white jerk, and the precision of what is new."""
+    down = [[j - i for j in range(_SHAFT)] for i in range(_SHAFT)]
+    kept = np.array([[steps**k / factorial(k) if k >= 0 else 0.0 * steps for k in row]
+                     for row in down]).transpose(2, 0, 1)
+    up = np.array([[5 - i - j for j in range(_SHAFT)] for i in range(_SHAFT)])
+    return kept, _UNSCALED / (size * steps[:, None, None] ** up)
+
+
+def _wander(steps: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return the same (step, 2, 2) of a phase whose rate wanders by `size`, rad a cell."""
+    decay, one = np.exp(-steps / MEMORY), np.ones(len(steps))
+    kept = np.array([[one, MEMORY * (1.0 - decay)], [0.0 * one, decay]]).transpose(2, 0, 1)
+    both = MEMORY * (1.0 - decay) ** 2
+    new = np.array([[MEMORY**2 * (2.0 * steps / MEMORY - 3.0 + 4.0 * decay - decay**2), both],
+                    [both, 1.0 - decay**2]]).transpose(2, 0, 1)
+    return kept, np.linalg.inv(new) / size**2
 
 
 def fitted(seen: Seen, starts: Sequence[Walk]) -> tuple[Walk, Posterior]:
