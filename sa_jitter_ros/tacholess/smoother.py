@@ -31,7 +31,7 @@ from scipy.optimize import minimize
 FloatArray = NDArray[np.float64]
 
 _SHAFT, _OWN = 3, 2  # states of the shaft, and of a line
-MEMORY = 50.0  # cells that the rate of the phase of a line lasts: about a resonance
+MEMORY = 100.0  # cells that the rate of the phase of a line lasts: about a resonance
 _WIDE = (1e-3, 1e4, 1e3)  # standard deviations of them at the first node, rad, rad/cell, ...
 _WIDE_PHASE = 10.0  # rad, of the own phase of a line at the first node
 _UNSCALED = np.linalg.inv([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]])
