@@ -32,6 +32,7 @@ _LOST = 0.02  # turns of the highest order by which its angle may be unknown fro
 _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
 _COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
 _UNTIED = 0.15  # rad a cell of their own, of lines that are not of one shaft
+_MISFIT = 20.0  # variance of the residuals of such lines, over that of the noise
 _SAME = 1e-6  # relative
 
 
@@ -72,7 +73,8 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     low, high = _range(speed_range, rate, wanted)
     if not (np.isfinite(maximum_rate) and maximum_rate > 0.0):
         raise ParameterError(f'maximum_rate is {maximum_rate} per s: give a positive one')
-    begin, end = _longest(np.isfinite(samples).any(axis=0), int(rate / high))
+    begin, end = _longest(np.asarray(np.isfinite(samples).any(axis=0)),
+                          int(rate / high))
     lacking = '' if end - begin == samples.shape[1] else (
         f'outside {start + begin / rate:.4g} to {start + end / rate:.4g} s samples are lacking')
     samples, start = samples[:, begin:end], start + begin / rate
@@ -86,7 +88,7 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     if phase is None:
         raise SignalError('no line is strong and steady enough to follow its phase: give other '
                           'orders, fewer in hold_out, or a sensor nearer to their source')
-    if phase.walk.own > _UNTIED:
+    if phase.walk.own > _UNTIED or phase.misfit.max() > _MISFIT:
         together = ', '.join(f'{order:g}' for order in phase.cells.orders)
         raise SignalError(f'the orders {together} do not turn together, as those of one shaft '
                           'do: give fewer of them, or another sensor')

@@ -31,7 +31,6 @@ _WHITE = 0.75  # of the variance of overlapping cells remains where their noise 
 _STRANGE = 25.0  # squared residual over its variance that no noise makes
 _FEWEST_BINS = 8  # over which the slow part of the noise is measured
 _MOST_STRANGE = 0.2  # share of such cells, beyond which the line is
-_WRONG = 50.0  # misfit of a line that is not tied to the shaft
 _LEAST = 40.0  # sum of the ratios of power of line and noise over cells, of a line that is there
 
 
@@ -147,8 +146,6 @@ def _smoothed(cells: Cells, before: Phase | None) -> Phase | None:
         mean = np.sum(ends * seen.taper, axis=(1, 2))
         correction = mean / (2.0 * np.pi * highest) - (cells.angle - cells.angle[0])
     misfit, slow = _misfit(seen, posterior)
-    if np.any(misfit > _WRONG):
-        return _smoothed(cells.chosen(misfit <= _WRONG), before)
     # Residuals that are larger than the noise of the cells count as noise.
     fair = replace(seen, precision=seen.precision / np.maximum(1.0, np.maximum(
         misfit, slow))[:, None])

@@ -12,8 +12,8 @@
 Phase of a shaft from its lines: a linear Gaussian Markov model, solved for all cells at once.
 
 States stand at nodes, before and after each cell: angle, speed and acceleration of the shaft, a
-random walk, and for every line a phase of its own and its rate, which wanders: resonances turn it
-smoothly. In a cell a line observes its order times the mean of the angle over the taper, plus its
+random walk, and for every line, and for all together, a phase of their own and its rate, which
+wanders: resonances turn it smoothly. In a cell a line observes its order times the mean of the angle over the taper, plus its
 own phase. The precision of the states is block-tridiagonal: one banded Cholesky factor gives mode,
 covariances and marginal likelihood, by which the sizes of the random walks are chosen.
 """
@@ -32,6 +32,7 @@ FloatArray = NDArray[np.float64]
 
 _SHAFT, _OWN = 3, 2  # states of the shaft, and of a line
 MEMORY = 100.0  # cells that the rate of the phase of a line lasts: about a resonance
+_SHARED = 2.0  # of what lines turn by themselves, all turn: resonances have one direction
 _WIDE = (1e-3, 1e4, 1e3)  # standard deviations of them at the first node, rad, rad/cell, ...
 _WIDE_PHASE = 10.0  # rad, of the own phase of a line at the first node
 _UNSCALED = np.linalg.inv([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]])
@@ -99,10 +100,11 @@ class Seen:
     def rows(self) -> FloatArray:
         """Return what each line sees (cell, line, 2 nodes x state) of the states."""
         lines = len(self.orders)
-        found = np.zeros((len(self.times), lines, 2, _SHAFT + (_OWN * lines if lines > 1 else 0)))
+        own = _OWN * (lines + 1) if lines > 1 else 0
+        found = np.zeros((len(self.times), lines, 2, _SHAFT + own))
         found[..., :2] = self.taper[:, None] * self.orders[:, None, None]
         if lines > 1:
-            found[:, :, 1, _SHAFT::_OWN] = np.eye(lines)
+            found[:, :, 1, _SHAFT::_OWN] = np.column_stack([np.eye(lines), np.ones(lines)])
         return found.reshape(*found.shape[:2], -1)
 
 
@@ -167,11 +169,12 @@ class _Prior:
     """Precision of the states before data: diagonal and below it; steps in units of a cell."""
 
     def __init__(self, steps: FloatArray, width: int, walk: Walk) -> None:
-        lines = (width - _SHAFT) // _OWN
         self._parts = [(slice(0, _SHAFT), *_jerk(steps, walk.shaft), np.array(_WIDE))]
-        self._parts += [(slice(first, first + _OWN), *_wander(steps, walk.own),
-                         np.array([_WIDE_PHASE, walk.own]))
-                        for first in range(_SHAFT, _SHAFT + _OWN * lines, _OWN)]
+        for begin in range(_SHAFT, width, _OWN):
+            shared = begin == width - _OWN
+            size = _SHARED * walk.own if shared else walk.own
+            self._parts.append((slice(begin, begin + _OWN), *_wander(steps, size), np.array(
+                [_WIDE[0] if shared else _WIDE_PHASE, size])))
         self.diagonal = np.zeros((len(steps) + 1, width, width))
         self.below = np.zeros((len(steps), width, width))
         for place, kept, inverse, first in self._parts:
