@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands import average, check_keyphasor, close_loop
 from sa_jitter_ros.tacholess.evidence import comb, spectra_of
-from sa_jitter_ros.tacholess.lines import demodulated, noise_power
+from sa_jitter_ros.tacholess.lines import demodulated, first_correction, noise_power
 from sa_jitter_ros.tacholess.path import best_path, without
 from scipy.interpolate import CubicSpline
 
@@ -108,6 +108,42 @@ def test_refusals_are_one_line_and_write_nothing(folder, words, message, capsys)
     assert not list(output.glob('*/averages.npz'))
 
 
+def test_orders_of_the_machine_file_and_a_second_run(folder, capsys):
+    """The comb follows from the gears; what is finished is skipped, unless the range differs."""
+    (folder / 'machine.yaml').write_text("""
+/**:
+  ros__parameters:
+    machine:
+      tach_shaft: input
+      gears: {stage: {shaft: input, teeth: 19, mate_shaft: output, mate_teeth: 61}}
+/**/synchronous_averager:
+  ros__parameters: {trigger_cycles: 40}
+""", encoding='utf-8')
+    output = folder / 'geared'
+    words = [str(folder / 'rig.npz'), '--params', str(folder / 'machine.yaml'), '--no-figures',
+             '--output', str(output), '--tacholess', '12']
+    times = []
+    for high in ('28', '28', '27'):
+        assert average.main([*words, high]) == 0
+        times.append((output / 'rig' / 'averages.npz').stat().st_mtime_ns)
+    assert times[0] == times[1] < times[2]
+    # Of 19, 38 and 57 the third has no line: two of three are enough, and only they are used.
+    assert 'pulses from orders 19, 38, at ' in capsys.readouterr().err
+
+
+def test_loop_of_a_folder_without_a_tach(folder):
+    several = folder / 'several'
+    several.mkdir()
+    (several / 'rig.npz').write_bytes((folder / 'rig.npz').read_bytes())
+    (several / 'noise.npz').write_bytes((folder / 'noise.npz').read_bytes())
+    assert close_loop.main([str(several), *TACHOLESS, '--quiet', '--declared',
+                            str(folder / 'model.yaml'), '--output', str(folder / 'loops')]) == 0
+    with open(folder / 'loops' / 'loops.csv', encoding='utf-8') as file:
+        rows = {row['recording']: row for row in csv.DictReader(file)}
+    assert rows['rig']['verdict'] == 'none'
+    assert 'stand out' in rows['noise']['error']
+
+
 def test_evidence_is_for_lines_not_for_noise_or_colour():
     rng = np.random.default_rng(3)
     time = np.arange(40_000) / 4e3
@@ -160,3 +196,15 @@ def test_noise_power_of_cells_is_that_of_white_noise():
                         np.array([7.0, 33.0]))
     values = cells.values / np.sqrt(np.mean(np.abs(cells.values) ** 2, axis=1))[:, None]
     assert noise_power(values).mean() == pytest.approx(4.0 / 3.0, rel=0.1)
+
+
+def test_first_correction_finds_how_far_a_rough_speed_is_off():
+    """A speed that is wrong by 0.3 % turns all lines from cell to cell, each by its order."""
+    rng = np.random.default_rng(8)
+    time = np.arange(80_000) / 8e3
+    vibration = sum(np.cos(2.0 * np.pi * order * 20.0 * time) for order in (17.0, 34.0, 51.0))
+    cells = demodulated((vibration + rng.standard_normal(time.size))[None], 8e3,
+                        20.0 * 1.003 * time, 1, np.array([17.0, 34.0, 51.0]))
+    corrected = cells.angle + first_correction(cells)
+    slope = np.polyfit(cells.times, corrected, 1)[0]
+    assert slope == pytest.approx(20.0, rel=5e-4)  # two steps of its grid

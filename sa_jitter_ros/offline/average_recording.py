@@ -232,7 +232,7 @@ def _settings(job: AverageJob) -> dict[str, Any]:
             'figures': job.figures, 'options': json_values(job.options),
             'averager': dict(job.machine.averager),
             'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector),
-            'tacholess': job.tacholess and asdict(job.tacholess)}
+            'tacholess': job.tacholess and json_values(asdict(job.tacholess))}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:

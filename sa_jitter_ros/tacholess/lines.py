@@ -26,6 +26,7 @@ _PIECE = 1 << 19  # samples of a channel at a time, so that memory stays small
 _CAP = 4.0  # amplitude over noise beyond which a line has no more to say of the first phase
 _TURN = 0.6  # of the strongest order, between cells, within which the first phase is sought
 _SEEN = 0.5  # share of the cells in which a channel has samples, at least
+_RADIAL = 3.05  # power of noise over what `noise_power` finds in its part along the line
 _USUAL = 0.25  # of it, beyond which a change is unlikely
 _OVERLAP = 4.0 / 3.0  # noise of tapered cells that overlap by half, over that of single ones
 NOISE_CELLS = 64  # over which noise is constant
@@ -116,7 +117,7 @@ class _Tapers:
         return np.asarray(self._sums(values) / self._weight)
 
 
-def noise_power(values: ComplexArray) -> FloatArray:
+def noise_power(values: NDArray[Any]) -> FloatArray:
     """
     Return the power (line, cell) of the noise of cells, from their changes.
 
@@ -145,7 +146,7 @@ def first_correction(cells: Cells) -> FloatArray:
     From cell to cell all lines turn by their order times the same angle: the path of this angle
     with the most agreement, as a whole.
     """
-    power = noise_power(cells.values)
+    power = _RADIAL * noise_power(np.abs(cells.values))  # which a wrong speed leaves alone
     seen = np.nan_to_num(cells.values / np.sqrt(power), nan=0.0, posinf=0.0, neginf=0.0)
     seen = seen / np.sqrt(1.0 + np.abs(seen) ** 2 / _CAP**2)
     turns = seen[:, 1:] * seen[:, :-1].conj()

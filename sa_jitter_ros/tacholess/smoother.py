@@ -13,9 +13,10 @@ Phase of a shaft from its lines: a linear Gaussian Markov model, solved for all 
 
 States stand at nodes, before and after each cell: angle, speed and acceleration of the shaft, a
 random walk, and for every line, and for all together, a phase of their own and its rate, which
-wanders: resonances turn it smoothly. In a cell a line observes its order times the mean of the angle over the taper, plus its
-own phase. The precision of the states is block-tridiagonal: one banded Cholesky factor gives mode,
-covariances and marginal likelihood, by which the sizes of the random walks are chosen.
+wanders: resonances turn it smoothly. In a cell a line observes its order times the mean of the
+angle over the taper, plus these phases. The precision of the states is block-tridiagonal: one
+banded Cholesky factor gives mode, covariances and marginal likelihood, by which the sizes of the
+random walks are chosen.
 """
 
 from collections.abc import Sequence
