@@ -151,7 +151,7 @@ def test_few_lost_samples_cost_nothing(run_up):
     broken[:, 30_000:30_020] = np.nan
     found = sa.find_pulses(broken, RATE, orders=ORDERS, speed_range=RANGE)
     assert found.reason == ''
-    assert found.times.size == whole.times.size
+    assert abs(found.times.size - whole.times.size) < 2  # phase 0 is arbitrary
     assert np.abs(error(found, angle)).max() < 0.005
 
 
@@ -266,24 +266,28 @@ def test_states_are_those_of_the_dense_model():
     assert evidence[1] - evidence[0] == pytest.approx(dense[1] - dense[0], abs=0.02)
 
 
-def test_run_up_through_resonances_is_covered_or_refused():
-    """Each line turns where it passes its resonances: errors stated hold that."""
-    for seed in range(3):
-        rng = np.random.default_rng(100 + seed)
-        speed = np.linspace(12.0, 20.0, int(20.0 * RATE))
-        turns = np.cumsum(speed) / RATE
-        vibration = 0.5 * rng.standard_normal((2, speed.size))
+def test_run_up_through_resonances():
+    """Each line turns by itself where it passes a resonance; the errors stated grow with it."""
+    ratios, larger = [], []
+    for seed in range(101, 106, 2):
+        rng = np.random.default_rng(seed)
+        time = np.arange(int(25.0 * RATE)) / RATE
+        turns = np.cumsum(12.0 + 0.5 * time + 0.05 * np.sin(2.0 * np.pi * 0.3 * time)) / RATE
+        speed = np.gradient(turns, 1.0 / RATE)
+        plain, turned = 0.5 * rng.standard_normal((2, 2, time.size))
         for order in ORDERS:
-            for channel in vibration:
-                place = rng.uniform(10.0, 28.0)
-                gain = 1.0 / (1.0 - (speed / place) ** 2 + 0.1j * speed / place)
-                gain /= np.median(np.abs(gain))
-                channel += np.real(gain * np.exp(2j * np.pi * order * turns))
-        try:
-            found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 26.0))
-        except sa.SignalError:
-            continue
-        off = error(found, lambda at, turns=turns: np.interp(
-            at, np.arange(turns.size) / RATE, turns))
-        stated = found.standard_errors * found.speed
-        assert off.std() < 2.5 * np.sqrt(np.mean(stated**2))
+            line = np.exp(2j * np.pi * order * turns)
+            for channel in range(2):
+                place, damping = rng.uniform(10.0, 28.0), rng.uniform(0.04, 0.1)
+                gain = 1.0 / (1.0 - (speed / place) ** 2 + 1j * damping * speed / place)
+                plain[channel] += line.real
+                turned[channel] += np.real(gain / np.median(np.abs(gain)) * line)
+        stated = []
+        for vibration in (plain, turned):
+            found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 31.0))
+            stated.append(np.median(found.standard_errors * found.speed))
+        off = error(found, lambda at, time=time, turns=turns: np.interp(at, time, turns))
+        ratios.append(off.std() / stated[1])
+        larger.append(stated[1] / stated[0])
+    assert np.median(larger) > 10.0
+    assert np.median(ratios) < 2.0

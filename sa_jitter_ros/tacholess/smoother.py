@@ -231,5 +231,5 @@ def fitted(seen: Seen, starts: Sequence[Walk]) -> tuple[Walk, Posterior]:
     begin = min((np.log([walk.shaft, walk.own]) for walk in starts), key=loss)
     walk = walk_of(minimize(loss, begin, method='Nelder-Mead', options={
         'initial_simplex': begin + np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]]),
-        'xatol': 0.1, 'fatol': 0.1, 'maxfev': 40}).x)
+        'xatol': 0.2, 'fatol': 0.2, 'maxfev': 25}).x)
     return walk, Posterior(seen, walk)
