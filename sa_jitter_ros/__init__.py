@@ -17,6 +17,7 @@ Synchronous averaging of vibration, and what jitter of the keyphasor does to it.
 |---|---|
 | `read` | open a recording |
 | `detect_pulses` | find the pulses of a keyphasor in its waveform |
+| `find_pulses` | find the pulses of a machine without a tach, from its own orders |
 | `pulses_from_angle` | find when a sampled angle or a counter passes the marks of a target |
 | `Machine` | a machine by its gears, planetary stages and bearings: ratios, and names of orders |
 | `average`, `Averager` | average vibration synchronously with a shaft, at once or on line |
@@ -48,12 +49,14 @@ if TYPE_CHECKING:
     from sa_jitter_ros.pulses.sampled_angle import pulses_from_angle
     from sa_jitter_ros.recordings.reading import read
     from sa_jitter_ros.recordings.recording import Recording
+    from sa_jitter_ros.tacholess.find import find_pulses
+    from sa_jitter_ros.tacholess.found import FoundPulses
 
 __all__ = [
-    'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'Loop', 'Machine',
+    'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'FoundPulses', 'Loop', 'Machine',
     'MessageError', 'ModelError', 'ParameterError', 'Prediction', 'Recording',
     'RecordingError', 'SaJitterError', 'SignalError', 'average', 'close_loop', 'design',
-    'detect_pulses', 'predict', 'pulses_from_angle', 'read']
+    'detect_pulses', 'find_pulses', 'predict', 'pulses_from_angle', 'read']
 
 # Modules are loaded when a name of theirs is first used: importing the package costs nothing.
 _HOMES = {
@@ -70,6 +73,8 @@ _HOMES = {
     'pulses.sampled_angle': ('pulses_from_angle',),
     'recordings.reading': ('read',),
     'recordings.recording': ('Recording',),
+    'tacholess.find': ('find_pulses',),
+    'tacholess.found': ('FoundPulses',),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -47,6 +47,8 @@ CORE = {
         'asammdf', 'errors', 'h5py', 'nptdms', 'parameters', 'pulses', 'pyuff', 'rosbags',
         'samples'},
     'simulation': SCIENCE | {'errors'},
+    'tacholess': SCIENCE | {
+        'averaging', 'errors', 'machine', 'parameters', 'recordings'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
         'samples'},
@@ -59,7 +61,7 @@ CORE = {
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'html_parts', 'json_values', 'keyphasor_check',
         'loop', 'machine', 'matplotlib', 'monitoring', 'number_text', 'parameter_file',
-        'parameters', 'pulses', 'recordings', 'samples'},
+        'parameters', 'pulses', 'recordings', 'samples', 'tacholess'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'html_parts', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},

@@ -25,7 +25,8 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, few_collections, Parser, read_options, show)
+    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, Parser,
+    read_options, show, tacholess_options)
 from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
@@ -64,6 +65,7 @@ def make_parser() -> Parser:
                         help='write arrays and tables only, no figures and no page')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_fleet_options(parser)
+    add_tacholess_options(parser)
     add_recording_options(parser)
     return parser
 
@@ -101,12 +103,13 @@ def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
     if machine.unknown:
         print(f'average: {options.params}: ignored, because synchronous_averager has no such '
               f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
+    tacholess = tacholess_options(options)
     found = recordings_of(options)
     output = options.output.absolute()
     keywords, fields = read_options(options), tuple(fields_of(options.fields))
     return [AverageJob(
         item.name, os.path.abspath(item.path), str(output / item.name), machine, keywords, fields,
-        not options.no_figures, options.state) for item in found if not item.error], [
+        not options.no_figures, options.state, tacholess) for item in found if not item.error], [
             Row(item.name, str(item.path), item.error) for item in found if item.error]
 
 

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, Parser, read_options, require_writable, show)
+    add_recording_options, add_tacholess_options, Parser, read_options, require_writable, show,
+    tacholess_options)
 from sa_jitter_ros.declaration import NODE, read_declaration
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.json_values import json_values
@@ -56,6 +57,7 @@ def make_parser() -> Parser:
                         help='parameter file of the machine: ratio, orders and pulses per '
                         'revolution of its first shaft, and its parts, which are checked')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
+    add_tacholess_options(parser)
     add_recording_options(parser)
     return parser
 
@@ -87,10 +89,13 @@ def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
 
     recording = read(options.recording, pulses_suffice=True,
                      **{**_machine_fields(options.params), **read_options(options)})
+    machine = Machine.among(_declared(options.params))
+    if tacholess := tacholess_options(options):
+        recording, _ = tacholess.pulses_of(recording, machine)
     for remark in recording.remarks:
         progress(remark)
-    return check_keyphasor(recording, teeth=options.teeth, progress=progress,
-                           machine=Machine.among(_declared(options.params))), recording
+    return check_keyphasor(recording, teeth=options.teeth, machine=machine,
+                           progress=progress), recording
 
 
 def main(args: Sequence[str] | None = None) -> int:

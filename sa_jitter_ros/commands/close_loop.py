@@ -26,8 +26,8 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, failure, few_collections, Parser, plain_warnings,
-    require_writable, show)
+    add_fleet_options, add_recording_options, add_tacholess_options, failure, few_collections,
+    Parser, plain_warnings, require_writable, show)
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
 
@@ -46,6 +46,7 @@ def make_parser() -> Parser:
                         help='folder for report.json, report.html and the figures')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_fleet_options(parser)
+    add_tacholess_options(parser)
     add_recording_options(parser)
     return parser
 

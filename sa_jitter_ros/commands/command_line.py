@@ -26,6 +26,7 @@ from sa_jitter_ros.errors import DataWarning, ParameterError
 from sa_jitter_ros.offline.settings import AVERAGER, section
 from sa_jitter_ros.recordings.channel_units import channels_of
 from sa_jitter_ros.recordings.fields import fields_of
+from sa_jitter_ros.tacholess.recording import Tacholess
 
 _OBJECTS = 1_000_000  # new ones after which Python looks for garbage, as a rule 700
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
@@ -134,6 +135,29 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='name or number of the column of a .csv with the times in s')
     group.add_argument('--sample-rate', type=float, metavar='HZ',
                        help='sampling rate of the vibration, if the file does not contain it')
+
+
+def add_tacholess_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options for recordings without a tach, or whose tach was lost for a while."""
+    group = parser.add_argument_group('without a tach')
+    group.add_argument('--tacholess', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+                       help='find the pulses in the vibration: speed of the tach shaft between '
+                       'LOW and HIGH, Hz')
+    group.add_argument('--comb', type=float, nargs='+', default=(), metavar='ORDER',
+                       help='orders of the tach shaft at which the machine has lines (default: '
+                       'those of the machine, or of the recording)')
+    group.add_argument('--bridge-tach', action='store_true',
+                       help='keep the pulses of the tach, and find only those that it lost')
+
+
+def tacholess_options(options: argparse.Namespace) -> Tacholess | None:
+    """Return how pulses are found, None where they are those of the tach."""
+    if options.tacholess is None:
+        if options.comb or options.bridge_tach:
+            raise ParameterError('--comb and --bridge-tach belong to --tacholess LOW HIGH: give '
+                                 'it')
+        return None
+    return Tacholess(tuple(options.tacholess), tuple(options.comb), options.bridge_tach)
 
 
 def add_fleet_options(parser: argparse.ArgumentParser) -> None:

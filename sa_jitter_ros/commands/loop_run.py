@@ -16,14 +16,14 @@ import os
 from pathlib import Path
 import sys
 
-from sa_jitter_ros.commands.command_line import read_options, show
+from sa_jitter_ros.commands.command_line import read_options, show, tacholess_options
 from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.offline.files import write_rows
 from sa_jitter_ros.offline.fleet import is_folder
-from sa_jitter_ros.offline.loop_recording import loop_file, LoopJob, LoopRow, on_target
+from sa_jitter_ros.offline.loop_recording import loop_file, LoopJob, LoopRow, with_pulses
 from sa_jitter_ros.recordings import read
 
 LOOPS = 'loops.csv'
@@ -36,7 +36,8 @@ def is_fleet(options: argparse.Namespace) -> bool:
 
 def run(options: argparse.Namespace, progress: Progress) -> Loop:
     """Close the loop on the recordings; raises SaJitterError."""
-    recordings = [on_target(read(path, **read_options(options)), options.declared)
+    tacholess = tacholess_options(options)
+    recordings = [with_pulses(read(path, **read_options(options)), options.declared, tacholess)
                   for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
     _tell_unknown(options.declared, declaration)
@@ -54,9 +55,10 @@ def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
     """Close the loop on each recording, and write their table; raises SaJitterError, OSError."""
     _tell_unknown(options.declared, read_declaration(options.declared, sample_rate=1e9))
     output, keywords = options.output.absolute(), read_options(options)
+    tacholess = tacholess_options(options)
     found = recordings_of(options)
     jobs = [LoopJob(item.name, os.path.abspath(item.path), str(output / item.name),
-                    os.path.abspath(options.declared), keywords)
+                    os.path.abspath(options.declared), keywords, tacholess)
             for item in found if not item.error]
     rows = [LoopRow(item.name, str(item.path), item.error) for item in found if item.error]
     try:

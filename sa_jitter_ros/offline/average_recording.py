@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
-from sa_jitter_ros.averaging.results import ShaftResults
+from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
 from sa_jitter_ros.json_values import json_values
@@ -39,12 +39,15 @@ from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
 from sa_jitter_ros.samples import SampleBlock
+from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
+from sa_jitter_ros.tacholess.recording import Tacholess
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 
-_VERSION = 4  # of the files: those of another one are written again
+FOUND = 'found_pulses.npz'
+_VERSION = 5  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
 
@@ -55,7 +58,8 @@ class AverageJob:
     One recording to average: its `name` in the results, its `path` and the folder of its files.
 
     `options` are keywords of `read`; `fields` among them are those that the user gave. The channel
-    `state`, a name or a number, may be constant.
+    `state`, a name or a number, may be constant. With `tacholess` the pulses are found in the
+    vibration.
     """
 
     name: str
@@ -66,6 +70,7 @@ class AverageJob:
     fields: tuple[str, ...] = ()
     figures: bool = True
     state: str = ''
+    tacholess: Tacholess | None = None
 
 
 @dataclass(frozen=True)
@@ -96,8 +101,8 @@ class RecordingAverager:
     """Averages a recording; the counts and remarks are complete when `results` is exhausted."""
 
     def __init__(self, recording: Recording, values: Values, detector: Values,
-                 limits: LimitWatch) -> None:
-        self._recording, self._values = recording, values
+                 limits: LimitWatch, found: FoundPulses | None = None) -> None:
+        self._recording, self._values, self._found = recording, values, found
         self._stream = streaming_averager(values, buffer_seconds=math.inf)
         self._results = {name: ShaftResults(gear_settings(values, name))
                          for name in values['shafts']}
@@ -183,10 +188,31 @@ class RecordingAverager:
         for name, average in averages:
             self.refused += average.correction is not None and not average.correction.accepted
             results = self._results[name].of(average)
+            if self._found is not None:
+                settings = self._stream.shafts[name].settings
+                results['order_amplitude'] = _with_found(
+                    results['order_amplitude'], self._found.correct(average, ratio=(
+                        settings.cycle_length / settings.revolutions_per_trigger)))
             if self.limits.names:
                 self.passed += self.limits.update(name, monitored(
                     results[KINDS[0]], *map(results.get, KINDS[1:])))
             yield name, results, average.refused
+
+
+def _with_found(message: AverageMessage, corrected: CorrectedAmplitudes) -> AverageMessage:
+    """Return order amplitudes with what the errors of found pulses did to them undone."""
+    size, expected = np.abs(corrected.amplitudes), corrected.expected
+    columns = {
+        'corrected_amplitude': size, 'corrected_phase': np.angle(corrected.amplitudes),
+        'attenuation': np.broadcast_to(expected.factor, size.shape),
+        'attenuation_standard_error': np.broadcast_to(
+            expected.standard_deviation, size.shape),
+        'corrected_standard_error': corrected.standard_errors,
+        'corrected_phase_standard_error': corrected.standard_errors / size}
+    values = message.values.copy()
+    for name, column in columns.items():
+        values[..., message.names.index(name)] = column
+    return replace(message, values=values)
 
 
 def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
@@ -216,7 +242,8 @@ def _settings(job: AverageJob) -> dict[str, Any]:
     return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
             'figures': job.figures, 'state': job.state, 'options': json_values(job.options),
             'averager': dict(job.machine.averager), 'hardware_id': job.machine.hardware_id,
-            'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector)}
+            'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector),
+            'tacholess': job.tacholess and json_values(asdict(job.tacholess))}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:
@@ -235,12 +262,18 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
            ': lower its gain, or choose a larger range')
         for channel, reason in faults.items())]
     recording = without_channels(recording, lost)
+    found = None
+    if job.tacholess is not None:
+        recording, found = job.tacholess.pulses_of(recording, job.machine.machine)
+        remarks.append(recording.remarks[-1])
     values = averager_values(job.machine, recording, fields=job.fields)
+    if found is not None:  # errors that are alike, which the averager would take for single ones
+        values = {**values, 'correct_jitter': False}
     labels = [(str(number), name) for number, name in zip(kept, recording.channel_names)]
     limits = LimitWatch(job.machine.machine, values['shafts'], labels=lambda count: labels)
     signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
                       job.machine.machine, limits)
-    averager = RecordingAverager(recording, values, detector_values(job.machine), limits)
+    averager = RecordingAverager(recording, values, detector_values(job.machine), limits, found)
     with finished_together(Path(job.folder)) as folder:
         series = collect(averager, folder.parent, progress)
         if not series:
@@ -252,6 +285,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
         write_averages(folder, signals, series, {
             'settings': settings, 'row': asdict(row), 'said': averager.passed,
             'limits': [*map(str, limits.passed())]})
+        if found is not None:
+            found.save(folder / FOUND)
         if job.figures:
             from sa_jitter_ros.offline.figures import write_figures
             write_figures(folder, signals, series, {

@@ -21,9 +21,11 @@ import warnings
 from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.loop import close_loop, Loop
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.offline.files import stamp
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.tacholess.recording import Tacholess
 
 _VERSION = 1  # of the files: those of another one are written again
 _JOB = 'job.json'  # what a finished folder is of
@@ -38,6 +40,7 @@ class LoopJob:
     folder: str
     declared: str
     options: Mapping[str, Any] = field(default_factory=dict)
+    tacholess: Tacholess | None = None
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,16 @@ class LoopRow:
     rms_before: float = math.nan
     rms_after: float = math.nan
     remarks: tuple[str, ...] = ()
+
+
+def with_pulses(recording: Recording, params: Path, tacholess: Tacholess | None) -> Recording:
+    """Return a recording whose pulses are found in the vibration, if that is asked."""
+    if tacholess is None:
+        return on_target(recording, params)
+    machine = Machine.among(read_parameters(params, 'jitter_predictor'))
+    found, _ = tacholess.pulses_of(on_target(recording, params), machine)
+    warnings.warn(found.remarks[-1], DataWarning, stacklevel=2)
+    return found
 
 
 def on_target(recording: Recording, params: Path) -> Recording:
@@ -81,7 +94,8 @@ def loop_file(job: LoopJob) -> LoopRow:
     try:
         settings = json_values({
             'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
-            'declared': Path(job.declared).read_text(encoding='utf-8'), 'options': job.options})
+            'declared': Path(job.declared).read_text(encoding='utf-8'), 'options': job.options,
+            'tacholess': job.tacholess and asdict(job.tacholess)})
         found = _finished(done)
         if found.get('settings') == settings:
             values: dict[str, Any] = {
@@ -90,7 +104,8 @@ def loop_file(job: LoopJob) -> LoopRow:
             return LoopRow(**values)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter('always', DataWarning)
-            recording = on_target(read(job.path, **job.options), Path(job.declared))
+            recording = with_pulses(
+                read(job.path, **job.options), Path(job.declared), job.tacholess)
             loop = close_loop(recording, job.declared, names=[job.name])
     except SaJitterError as error:
         return LoopRow(job.name, job.path, error=str(error))

@@ -1,0 +1,200 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""`find_pulses`: pulse times of the tach shaft from vibration alone, or the reason why not."""
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.parameters import number, numbers
+from sa_jitter_ros.tacholess.found import FoundPulses
+from sa_jitter_ros.tacholess.phase import Phase, phase_of
+from sa_jitter_ros.tacholess.rough import Rough, rough_speed
+
+FloatArray = NDArray[np.float64]
+
+_PRESENT = 0.3  # nats a frame, of an order whose phase is used
+_MOST_ORDERS = 12  # of which the phase is looked at
+_BAND = 0.45  # of the sampling rate, up to which lines are used
+_MOST_CELLS = 20_000
+_FEWEST_CELLS = 16
+_LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
+_SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
+_COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
+_UNTIED = 0.15  # rad a cell of their own, of lines that are not of one shaft
+_MISFIT = 20.0  # variance of the residuals of such lines, over that of the noise
+_SAME = 1e-6  # relative
+
+
+def find_pulses(vibration: ArrayLike, sample_rate: float, *,
+                speed_range: Sequence[float], orders: Sequence[float] | None = None,
+                machine: Machine | None = None, start_time: float = 0.0,
+                hold_out: Collection[float] = (), maximum_rate: float = 0.5) -> FoundPulses:
+    """
+    Return when the tach shaft begins its revolutions, found from the vibration alone.
+
+    `vibration` (channel, sample), or (sample,) for one channel, has lines at `orders`, multiples
+    of the speed of the tach shaft; with a `machine` they are those of its meshes. The speed is
+    sought within `speed_range`, (lowest, highest) in Hz; it changes by at most `maximum_rate`,
+    relative and per s. Samples that are not finite are gaps. The phase of orders in `hold_out` is
+    not used: averages of them are free of bias. Where phase 0 lies on the shaft is arbitrary.
+
+    Raises ParameterError for parameters that cannot be used, and SignalError where the vibration
+    does not tell the speed: nothing stands out, two speeds fit, or it is too short. Sources: a
+    comb over orders, as in Hou et al., "Comparison of tacholess order tracking", MSSP (2016), its
+    path by dynamic programming (Viterbi), and a Rauch-Tung-Striebel smoother of the phase.
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> time = np.arange(60_000) / 5e3
+    >>> angle = 25.0 * time + 0.3 * np.sin(time)  # revolutions
+    >>> vibration = np.cos(2.0 * np.pi * 19.0 * angle) + 0.5 * np.cos(2.0 * np.pi * 38.0 * angle)
+    >>> vibration += np.random.default_rng(1).normal(0.0, 1.0, time.size)
+    >>> found = sa.find_pulses(vibration, 5e3, orders=[19.0, 38.0], speed_range=(18.0, 33.0))
+    >>> error = np.interp(found.times, time, angle) % 1.0
+    >>> bool(np.ptp(error) < 1e-3), found.reason
+    (True, '')
+    """
+    samples = _checked(vibration)
+    rate, start = number('sample_rate', sample_rate), number('start_time', start_time)
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise ParameterError(f'sample_rate is {rate} Hz: give a positive rate')
+    wanted = _orders(orders, machine)
+    low, high = _range(speed_range, rate, wanted)
+    if not (np.isfinite(maximum_rate) and maximum_rate > 0.0):
+        raise ParameterError(f'maximum_rate is {maximum_rate} per s: give a positive one')
+    begin, end = _longest(np.asarray(np.isfinite(samples).any(axis=0)),
+                          int(rate / high))
+    lacking = '' if end - begin == samples.shape[1] else (
+        f'outside {start + begin / rate:.4g} to {start + end / rate:.4g} s samples are lacking')
+    samples, start = samples[:, begin:end], start + begin / rate
+    rough = rough_speed(samples, rate, wanted, (low, high), maximum_rate)
+    kept = np.array([not np.any(np.abs(np.asarray([*hold_out]) - order) <= _SAME * order)
+                     for order in wanted])
+    kept &= (rough.evidence > _PRESENT) & (wanted * rough.speed.max() < _BAND * rate)
+    strongest = np.argsort(-np.where(kept, rough.evidence, -np.inf))[:_MOST_ORDERS]
+    used = wanted[np.sort(strongest)][kept[np.sort(strongest)]]
+    phase = _phase(samples, rate, rough, used) if used.size else None
+    if phase is None:
+        raise SignalError('no line is strong and steady enough to follow its phase: give other '
+                          'orders, fewer in hold_out, or a sensor nearer to their source')
+    if phase.walk.own > _UNTIED or phase.misfit.max() > _MISFIT:
+        together = ', '.join(f'{order:g}' for order in phase.cells.orders)
+        raise SignalError(f'the orders {together} do not turn together, as those of one shaft '
+                          'do: give fewer of them, or another sensor')
+    first, last, reason = _stretch(phase, rough, start)
+    return FoundPulses.between(phase, first, last, start, wanted, '; '.join(
+        filter(None, [lacking, reason])))
+
+
+def _checked(vibration: ArrayLike) -> FloatArray:
+    samples = np.asarray(vibration)
+    if samples.ndim == 1:
+        samples = samples[None]
+    if samples.ndim != 2 or samples.dtype.kind not in 'fiu' or not samples.size:
+        raise SignalError(f'vibration has type {samples.dtype} and shape {samples.shape}: give '
+                          'real numbers, (channel, sample) or (sample,)')
+    if samples.shape[0] > samples.shape[1]:
+        raise SignalError(f'vibration has {samples.shape[0]} channels of {samples.shape[1]} '
+                          'samples: give (channel, sample), transpose it')
+    return np.where(np.isfinite(samples), samples, np.nan).astype(np.float64)
+
+
+def _longest(present: NDArray[np.bool_], gap: int) -> tuple[int, int]:
+    """Return begin and end of the most samples (sample,) without a gap of more than `gap`."""
+    known = np.flatnonzero(present)
+    if not known.size:
+        raise SignalError('vibration has no finite sample: give another recording')
+    cuts = np.flatnonzero(np.diff(known) > gap)
+    begins, ends = known[np.r_[0, cuts + 1]], known[np.r_[cuts, known.size - 1]] + 1
+    longest = int(np.argmax(ends - begins))
+    return int(begins[longest]), int(ends[longest])
+
+
+def _orders(orders: Sequence[float] | None, machine: Machine | None) -> FloatArray:
+    """Return the orders of the comb, in ascending order; raises ParameterError."""
+    if orders is None and machine is None:
+        raise ParameterError('neither orders nor machine is given: give the orders of the tach '
+                             'shaft at which the machine has lines')
+    if orders is None:
+        if not isinstance(machine, Machine):
+            raise ParameterError(f'machine is of type {type(machine).__name__}: give a Machine, '
+                                 'Machine.read(path)')
+        orders = [order for name, order in machine.places().items()
+                  if name.startswith('mesh ') and name.endswith('x')]
+    found = np.unique(np.round(numbers('orders', orders), 9))
+    if not found.size or not np.all(np.isfinite(found)) or found[0] <= 0.0:
+        raise ParameterError(f'orders are {found.tolist()}: give one or more, all above 0')
+    return np.asarray(found, dtype=np.float64)
+
+
+def _range(speed_range: Sequence[float], rate: float, orders: FloatArray) -> tuple[float, float]:
+    """Return the lowest and highest speed; raises ParameterError."""
+    found = numbers('speed_range', speed_range)
+    if len(found) != 2 or not np.all(np.isfinite(found)) or not 0.0 < found[0] < found[1]:
+        raise ParameterError(f'speed_range is {[*found]}: give (lowest, highest) speed in Hz, '
+                             'both above 0, the lowest first')
+    if orders[0] * found[1] > _BAND * rate:
+        raise ParameterError(
+            f'speed_range goes to {found[1]:g} Hz, where the lowest order {orders[0]:g} is at '
+            f'{orders[0] * found[1]:g} Hz: a sample_rate of {rate:g} Hz shows up to '
+            f'{_BAND * rate:g} Hz')
+    return float(found[0]), float(found[1])
+
+
+def _phase(samples: FloatArray, rate: float, rough: Rough, orders: FloatArray
+           ) -> Phase | None:
+    """Return the phase in cells that part the orders of lines from each other."""
+    spacing = float(np.min(np.diff(np.concatenate([[0.0], orders]))))
+    angle = rough.angle(rate, samples.shape[1])
+    revolutions = max(int(np.ceil(2.0 / spacing)), 1,
+                      int(np.ceil((angle[-1] - angle[0]) / _MOST_CELLS)))
+    if (angle[-1] - angle[0]) / revolutions < _FEWEST_CELLS:
+        raise SignalError(f'{angle[-1] - angle[0]:.3g} revolutions: at least '
+                          f'{_FEWEST_CELLS * revolutions} are needed to follow the phase; give a '
+                          'longer recording')
+    return phase_of(samples, rate, angle, revolutions, orders)
+
+
+def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
+    """Return the first and last node of the longest stretch in which the phase is known."""
+    pairs, width = phase.posterior.pairs, phase.posterior.mode.shape[1]
+    step = np.sqrt(pairs[:, 0, 0] + pairs[:, width, width] - 2.0 * pairs[:, 0, width])
+    cells = np.diff(phase.seen.nodes) / phase.seen.unit
+    surprise = np.sqrt(phase.walk.shaft * cells**5 / 20.0)  # of the angle, by a change of the jerk
+    known = (step / (2.0 * np.pi) < _LOST) & (surprise < _SURPRISE)
+    known &= _agree(phase, rough)
+    known[[0, -1]] = False  # no cell beyond it
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
+    begins, ends = edges[::2], edges[1::2]
+    if not len(begins) or (ends - begins).max() < _FEWEST_CELLS:
+        raise SignalError('the lines are too weak, or change too fast, to follow their phase '
+                          'without losing turns: give other orders or another sensor')
+    longest = int(np.argmax(ends - begins))
+    first, last = int(begins[longest]), int(ends[longest])
+    nodes = phase.seen.nodes + start
+    lost = [f'{side} {nodes[k]:.4g} s' for side, k, end in (
+        ('before', first, 1), ('after', last, len(known) - 1)) if k != end]
+    return first, last, (f'{" and ".join(lost)} the lines are too weak, or change too fast, to '
+                         'follow their phase' if lost else '')
+
+
+def _agree(phase: Phase, rough: Rough) -> NDArray[np.bool_]:
+    """Return in which cells (cell,) phase and spectra have the same speed."""
+    nodes = phase.seen.nodes
+    speed = np.exp(np.interp(nodes, rough.times, np.log(rough.speed)))
+    turns = np.cumsum((phase.states[:, 1] - speed) * np.gradient(nodes)) * phase.highest
+    cells = min(_COMPARED, len(nodes) // 2)
+    apart = np.abs(turns[cells:] - turns[:-cells]) > _SLIPPED
+    wrong = np.convolve(apart, np.ones(cells), mode='full') > 0.5
+    return np.asarray(~wrong[:len(nodes) - 1])
