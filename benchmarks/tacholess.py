@@ -13,8 +13,8 @@ Pulses without a tach: errors over stated ones, coverage, refusals, wrong ones, 
 
 `python benchmarks/tacholess.py` prints the tables of docs/tacholess.md: machines drawn at random,
 measured recordings with their tach hidden (`--data`), and the speed. Machines of another simulator
-(`--simulator`, a file with `make(kind, effects, seed)` and `MACH`) are a set of their own, on
-which nothing was chosen. With rota-order installed its speed stands beside; `comb and spline` is
+(`--simulator`, a file with `make(kind, effects, seed)` and `MACH`) are a set of their own. With
+rota-order installed its speed stands beside; `comb and spline` is
 the maximum of a comb in each spectrogram frame next to the one before, and a smoothing spline, as
 MATLAB's rpmtrack has it. Wrong is a speed off by 2 % in the median, or an angle off by more than
 half a turn of the highest order used.

@@ -33,7 +33,7 @@ _LARGEST = 600.0  # power over noise, beyond which the incomplete gamma function
 
 
 @dataclass(frozen=True)
-class Spectra:
+class CombSpectra:
     """Evidence (frame, bin) in nats for a line in a bin; `times` (frame,) in s, `step` in Hz."""
 
     evidence: NDArray[np.float32]
@@ -43,7 +43,7 @@ class Spectra:
 
 
 def spectra_of(vibration: FloatArray, sample_rate: float, seconds: float, highest: float
-               ) -> Spectra:
+               ) -> CombSpectra:
     """
     Return the evidence for lines up to `highest` Hz in frames of `seconds`.
 
@@ -76,8 +76,8 @@ def spectra_of(vibration: FloatArray, sample_rate: float, seconds: float, highes
         np.maximum(total / np.maximum(seen, 1.0)[:, None] - 1.0, 0.0))
     evidence[seen == 0] = 0.0
     evidence[:, 0] = 0.0
-    return Spectra(evidence.astype(np.float32), (starts + size / 2.0) / sample_rate,
-                   sample_rate / size, size / sample_rate)
+    return CombSpectra(evidence.astype(np.float32), (starts + size / 2.0) / sample_rate,
+                       sample_rate / size, size / sample_rate)
 
 
 def _floor(power: FloatArray) -> FloatArray:
@@ -99,7 +99,7 @@ def _evidence(surprise: FloatArray) -> FloatArray:
     return np.log(_ABSENT + (1.0 - _ABSENT) * odds)
 
 
-def comb(spectra: Spectra, speeds: FloatArray, orders: FloatArray) -> NDArray[np.float32]:
+def comb(spectra: CombSpectra, speeds: FloatArray, orders: FloatArray) -> NDArray[np.float32]:
     """Return the evidence (frame, speed) summed over the orders, those in the band."""
     found = np.zeros((len(spectra.times), len(speeds)), np.float32)
     last = spectra.evidence.shape[1] - 1

@@ -76,6 +76,15 @@ class FoundPulses:
     `used` are those of them whose phase was used. `reason` says why the pulses do
     not cover the recording, '' if they do. Errors of neighbouring pulses are alike: the jitter of
     single pulses says nothing of them, `covariance` does.
+
+    >>> rng = np.random.default_rng(2)
+    >>> time = np.arange(60_000) / 4e3
+    >>> mesh = np.cos(2 * np.pi * 23 * (24 * time + 0.1 * np.sin(time)) * np.array([[1], [2]]))
+    >>> from sa_jitter_ros.tacholess.find import find_pulses
+    >>> found = find_pulses(mesh.sum(axis=0) + rng.normal(0, 0.5, time.size), 4e3,
+    ...                     orders=[23, 46], speed_range=(20, 30))
+    >>> found.used, found.times.size > 300, found.expected([23], 50).attenuation.round(2)
+    ((23.0, 46.0), True, array([1.]))
     """
 
     times: FloatArray

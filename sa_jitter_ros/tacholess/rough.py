@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.tacholess.evidence import comb, Spectra, spectra_of
+from sa_jitter_ros.tacholess.evidence import comb, CombSpectra, spectra_of
 from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
 
 FloatArray = NDArray[np.float64]
@@ -56,7 +56,7 @@ class Rough:
 
 @dataclass(frozen=True)
 class _Track:
-    spectra: Spectra
+    spectra: CombSpectra
     speeds: FloatArray
     evidence: NDArray[np.float32]
     path: NDArray[np.intp]
@@ -103,7 +103,7 @@ def rough_speed(vibration: FloatArray, sample_rate: float, orders: FloatArray,
     return found
 
 
-def _track(spectra: Spectra, orders: FloatArray, speed_range: tuple[float, float],
+def _track(spectra: CombSpectra, orders: FloatArray, speed_range: tuple[float, float],
            maximum_rate: float) -> _Track:
     low, high = np.log(speed_range)
     step = min(_STEP * spectra.step / (orders.max() * np.exp(high)), _COARSEST)
@@ -119,7 +119,7 @@ def _track(spectra: Spectra, orders: FloatArray, speed_range: tuple[float, float
                   float(np.median(speeds[other])), float(np.mean(apart <= RULED_OUT)))
 
 
-def _by_order(spectra: Spectra, speed: FloatArray, orders: FloatArray) -> FloatArray:
+def _by_order(spectra: CombSpectra, speed: FloatArray, orders: FloatArray) -> FloatArray:
     """Return the evidence (order,) in nats a frame along a path (frame,)."""
     place = np.rint(np.outer(speed, orders) / spectra.step).astype(int)
     within = place < spectra.evidence.shape[1]
