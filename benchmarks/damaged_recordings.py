@@ -190,7 +190,8 @@ def draw(seed: int) -> Case:
     effect = EFFECTS[int(rng.integers(len(EFFECTS)))]
     drawn = draw_case((effect,) if effect else (), seed)
     machine = replace(drawn.machine, acquisitions=min(drawn.machine.acquisitions, 12))
-    case = Case(dict(record(machine, drawn.what, rng)), declared(machine).replace('jitter_predictor:', '/**:'), rng)
+    text = declared(machine).replace('jitter_predictor:', '/**:')
+    case = Case(dict(record(machine, drawn.what, rng)), text, rng)
     for _ in range(int(rng.integers(1, 4))):
         with contextlib.suppress(KeyError, ValueError, TypeError, IndexError):  # damaged before
             case.any_of(DAMAGES)(case)

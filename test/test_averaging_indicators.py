@@ -259,6 +259,11 @@ class TestHistory:
         assert found[0] == pytest.approx(1.5, rel=1e-9)
         assert found[1] == pytest.approx(1.5 * 0.6**4 / (0.5 * (0.3**2 + 0.6**2))**2, rel=1e-9)
 
+    def test_an_average_that_is_nothing_beside_earlier_ones_has_no_na4(self, rng):
+        history = rng.normal(size=(5, 2, 256)) * np.array([1e60, 1e60, 1e60, 1e60, 1e-60])[
+            :, None, None]
+        assert np.all(condition_indicators(history, self.settings)['na4'][-1] == 0.0)
+
     def test_na4_follows_the_level_where_kurtosis_does_not(self, rng):
         average = rng.normal(size=(1, 256))
         found = condition_indicators(np.stack([average, average, 3.0 * average]), self.settings)

@@ -23,6 +23,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS
 from sa_jitter_ros.commands import average, check_keyphasor
+from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -277,6 +278,14 @@ def test_unusable_input_is_one_line_and_status_2(
     assert captured.err.startswith('average: ')
     assert says in captured.err
     assert not list(tmp_path.glob('out/*'))
+
+
+def test_a_tach_that_is_recorded_twice_is_drawn(tmp_path):
+    """Every pulse comes twice: half of them are strays, at the times of the others."""
+    times = np.repeat(np.arange(0.2, 9.0, 0.05), 2)
+    recording = Recording(ArraySource(np.zeros((1, 5000))), 500.0, pulse_times=times)
+    assert write_repairs(tmp_path, 'twice', recording, times, [(times[8], 'spurious')])
+    assert imread(tmp_path / 'repairs.png').shape[1] > 600
 
 
 def test_what_was_repaired_is_drawn(tmp_path):

@@ -604,7 +604,8 @@ class _History:
 
         def over(moment: Array, reference: Array, power: int) -> Array:
             share = reference / scale
-            return np.asarray(moment / np.where(share > _ROUNDING**2, share, np.nan) ** power)
+            with np.errstate(over='ignore'):  # nothing beside earlier averages that large
+                return np.asarray(moment / np.where(share > _ROUNDING**2, share, np.nan) ** power)
 
         values = moments.own.copy()
         residual, difference = moments.residual * scale, moments.difference * scale

@@ -38,9 +38,10 @@ def repairs_figure(name: str, recording: Recording, pulses: FloatArray, rejected
     `pulses` (n,) in s are all that came; `rejected` are times (s) of those that were not taken as
     they came, and of missing ones, each with the reason.
     """
-    if not rejected or pulses.size < 2:
+    intervals = np.diff(pulses)
+    if not rejected or not (intervals > 0.0).any():
         return None
-    interval = float(np.median(np.diff(pulses)))
+    interval = float(np.median(intervals[intervals > 0.0]))  # doubles are at the same time
     places = worst_places(np.array([time for time, _ in rejected]), _AROUND * interval)
     figure = Figure(figsize=(9.0, 1.5 * len(places) + 1.0), layout='constrained')
     panels = figure.subplots(len(places), 1, squeeze=False).ravel()
