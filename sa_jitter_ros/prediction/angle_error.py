@@ -173,14 +173,25 @@ def drawn_normal(
     blocks = np.zeros((cycles, u.size, u.size))
     for lag in range(length + 1):
         blocks[lag] = covariance(u[:, None], u, lag)
-    lags = np.arange(cycles) - np.arange(cycles)[:, None]
-    both = np.concatenate((blocks, blocks[:0:-1].transpose(0, 2, 1)))  # negative lags count back
-    matrix = both[lags].transpose(0, 2, 1, 3).reshape(cycles * u.size, -1)
-    size, axes = np.linalg.eigh(matrix)
-    kept = size > _RANK * size[-1]
-    factor = (axes[:, kept] * np.sqrt(size[kept])).astype(np.float32)
+    factor = _root(blocks.tobytes(), cycles)
     z = rng.standard_normal((factor.shape[1], count), np.float32)
     return np.asarray((factor @ z).reshape(cycles, u.size, count))
+
+
+@lru_cache(maxsize=4)  # effects are tried with the same numbers again and again
+def _root(covariance: bytes, cycles: int) -> NDArray[np.float32]:
+    """Return a root (cycle u, n) of a covariance (lag, u, u) of cycles, given by its bytes."""
+    values = np.frombuffer(covariance)
+    points = math.isqrt(values.size // cycles)
+    blocks = values.reshape(cycles, points, points)
+    lags = np.arange(cycles) - np.arange(cycles)[:, None]
+    both = np.concatenate((blocks, blocks[:0:-1].transpose(0, 2, 1)))  # negative lags count back
+    matrix = both[lags].transpose(0, 2, 1, 3).reshape(cycles * points, -1)
+    size, axes = np.linalg.eigh(matrix)
+    kept = size > _RANK * size[-1]
+    factor = np.asarray(axes[:, kept] * np.sqrt(size[kept]), np.float32)
+    factor.flags.writeable = False
+    return factor
 
 
 def joint_characteristic(
