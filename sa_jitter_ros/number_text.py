@@ -16,6 +16,7 @@ from typing import Any
 
 Json = Any
 
+HALF_95 = 1.96  # standard errors from the middle of a 95 % interval to its end
 _PREFIXES = (('', 1.0), ('m', 1e-3), ('µ', 1e-6), ('n', 1e-9))
 _PREFIXED = ('s', 'rad')
 _LARGE = (('T', 1e12), ('G', 1e9), ('M', 1e6))  # prefixes of a frequency

@@ -54,9 +54,8 @@ def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
                      + ': count the teeth')
     if found:
         return [Warn('machine_contradicted', found)]
-    meshes = _meshes(machine)
     if not meshes_seen(lines, machine):
-        listed = ', '.join(f'{name} {place:.5g}' for name, place in meshes.items()
+        listed = ', '.join(f'{name} {place:.5g}' for name, place in machine.meshes().items()
                            if name.endswith(' 1x'))
         return [Warn('mesh_absent', f'no line of the vibration is at a mesh of the machine ('
                      f'{listed}, in orders of the tach shaft): check tach_shaft, the teeth and '
@@ -66,12 +65,7 @@ def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
 
 def meshes_seen(lines: ToothLines, machine: Machine) -> int:
     """Return how many lines, in orders of the tach shaft, are at a mesh of the machine."""
-    return int(np.count_nonzero(_near(lines, np.array([*_meshes(machine).values()]))))
-
-
-def _meshes(machine: Machine) -> dict[str, float]:
-    return {name: place for name, place in machine.places().items()
-            if name.startswith('mesh ') and name.endswith('x')}
+    return int(np.count_nonzero(_near(lines, np.array([*machine.meshes().values()]))))
 
 
 def _variants(machine: Machine) -> Iterator[tuple[str, int, int, Machine]]:

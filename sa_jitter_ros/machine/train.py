@@ -185,6 +185,11 @@ class Machine:
         return {name: self.ratio(shaft) * order for shaft in self.shafts
                 for name, order in self.gear_orders(shaft).items()}
 
+    def meshes(self) -> dict[str, float]:
+        """Return the meshes and their harmonics as multiples of the speed of the tach shaft."""
+        return {name: place for name, place in self.places().items()
+                if name.startswith('mesh ') and name.endswith('x')}
+
     def gear_orders(self, shaft: str) -> dict[str, float]:
         """Return the orders of gears and planetary stages by name; raises ParameterError."""
         self.ratio(shaft)

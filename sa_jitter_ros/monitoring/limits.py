@@ -28,13 +28,12 @@ from sa_jitter_ros.averaging.indicators import INDICATORS
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import LEVELS, Limit, Machine
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
-from sa_jitter_ros.number_text import measured_text
+from sa_jitter_ros.number_text import HALF_95, measured_text
 
 FloatArray = NDArray[np.float64]
 #: Of a number of channels, the names that a limit may call each.
 Labels = Callable[[int], Sequence[Sequence[str]]]
 
-_HALF = 1.96  # of a 95 % interval, standard errors
 _PARAMETERS = {'order': 'orders', 'bearing': 'bearing_orders', 'indicator': 'mesh_orders'}
 _SAME = 1e-5  # by which an order may differ from that of a limit, relative
 
@@ -86,7 +85,7 @@ class PassedLimit:
         'mesh input-output 1x of input, channel 0: 0.913 +- 0.031 above 0.8 (alarm, 4 times the \
 baseline), since day 3'
         """
-        value = measured_text(self.value, _HALF * self.error).replace('±', '+-')
+        value = measured_text(self.value, HALF_95 * self.error).replace('±', '+-')
         times = f', {self.times:g} times the baseline' if math.isfinite(self.times) else ''
         return (f'{self.what} of {self.shaft}, channel {self.channel}: {value} above '
                 f'{self.bound:.4g} ({self.level}{times}), since {since}')
@@ -218,7 +217,7 @@ class LimitWatch:
         if not math.isfinite(value + error + scale) or (
                 before is not None and before.is_corrected and not corrected):
             return []
-        level = _level(value, _HALF * error, {
+        level = _level(value, HALF_95 * error, {
             level: scale * bound for level, bound in limit.bounds.items()}, before)
         if not level:
             gone = self._passed.pop((name, channel), None)

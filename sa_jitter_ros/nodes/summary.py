@@ -22,7 +22,7 @@ from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.monitoring.limits import PassedLimit
-from sa_jitter_ros.number_text import measured_text, order_text
+from sa_jitter_ros.number_text import HALF_95, measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
 
@@ -31,7 +31,6 @@ FloatArray = NDArray[np.float64]
 _ORDERS = 10  # the strongest ones
 _STATUS = dict(zip(('', *LEVELS), (
     DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)))
-_HALF = 1.96  # of a 95 % interval, standard errors
 
 
 def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: ChannelScale,
@@ -95,6 +94,6 @@ def _interval(value: float, error: float, unit: str) -> str:
     >>> _interval(0.99823, 0.0061, 'm/s^2')
     '0.998 +- 0.012 m/s^2'
     """
-    half = _HALF * error
+    half = HALF_95 * error
     text = measured_text(float(value), float(half)) if math.isfinite(half) else f'{value:.4g}'
     return ' '.join(filter(None, (text.replace('±', '+-'), unit)))

@@ -25,7 +25,7 @@ import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.html_parts import figure, kept, page, table
 from sa_jitter_ros.machine import LEVELS, Machine
-from sa_jitter_ros.number_text import measured_text, order_text, order_words, percent_text
+from sa_jitter_ros.number_text import HALF_95, measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
 from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
 from sa_jitter_ros.offline.plotting import squared
@@ -35,7 +35,6 @@ PAGE = 'page.html'
 _OVER_ANGLE = ('waveform', '_average', '_standard_error', '_spectrum')  # ends of names, unused
 _CHANNELS, _ORDERS = 3, 10  # the strongest ones
 _CLEAR = 0.05  # standard error of an attenuation that is one
-_HALF = 1.96  # of a 95 % interval, standard errors
 _FIGURES = {'waveform': 'Average', 'spectrum': 'Order spectrum', 'tracked_orders': 'Trend',
             'envelope': 'Squared envelope'}
 
@@ -166,12 +165,12 @@ def _interval(value: float, error: float, unit: str = '') -> str:
     """
     if not math.isfinite(value):
         return '–'
-    return measured_text(float(value), _HALF * float(error) if math.isfinite(error) else None,
+    return measured_text(float(value), HALF_95 * float(error) if math.isfinite(error) else None,
                          unit)
 
 
 def _share(value: float, error: float) -> str:
-    return percent_text(float(value), _HALF * float(error)) if error < _CLEAR else '–'
+    return percent_text(float(value), HALF_95 * float(error)) if error < _CLEAR else '–'
 
 
 # --- the keyphasor -------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from sa_jitter_ros.effects.effect import Effect, effects_of
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
-from sa_jitter_ros.number_text import order_text
+from sa_jitter_ros.number_text import HALF_95, order_text
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import (
     add_legend, AFTER, arrange, BEFORE, MEASURED, panels, with_effects)
@@ -35,7 +35,6 @@ Array = NDArray[Any]
 _FEWEST_CYCLES = 3
 _MOST_PANELS = 3
 _POINTS = 200
-_BAND = 1.96
 _COMPRESSION = 1  # files are a tenth larger than by the default, 6, in half the time
 _LONG = 8  # letters of an order that has a name
 _SPREAD = 0.6  # share of the distance between orders over which the lines of one are spread
@@ -137,7 +136,7 @@ def _residual_figure(trace: Trace) -> Figure:
     axes[0].set_ylabel('attenuation\n(1: no loss)')
     add_legend(axes[0])
     for row, (label, colour, _, residual) in zip(axes[1:], versions):
-        half = _BAND * residual.standard_error
+        half = HALF_95 * residual.standard_error
         row.bar(position, 2.0 * half, bottom=-half, color='0.85', label='95 % band',
                 width=_SPREAD / np.unique(trace.lines.channel).size)
         row.errorbar(position, residual.mean, yerr=residual.standard_error, fmt='o', color=colour,

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.parameters import number, numbers
-from sa_jitter_ros.tacholess.found import FoundPulses
+from sa_jitter_ros.tacholess.found import among, FoundPulses
 from sa_jitter_ros.tacholess.phase import Phase, phase_of
 from sa_jitter_ros.tacholess.rough import Rough, rough_speed
 
@@ -33,7 +33,6 @@ _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is 
 _COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
 _UNTIED = 0.15  # rad a cell of their own, of lines that are not of one shaft
 _MISFIT = 20.0  # variance of the residuals of such lines, over that of the noise
-_SAME = 1e-6  # relative
 
 
 def find_pulses(vibration: ArrayLike, sample_rate: float, *,
@@ -79,8 +78,7 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
         f'outside {start + begin / rate:.4g} to {start + end / rate:.4g} s samples are lacking')
     samples, start = samples[:, begin:end], start + begin / rate
     rough = rough_speed(samples, rate, wanted, (low, high), maximum_rate)
-    kept = np.array([not np.any(np.abs(np.asarray([*hold_out]) - order) <= _SAME * order)
-                     for order in wanted])
+    kept = ~among(wanted, [*hold_out])
     kept &= (rough.evidence > _PRESENT) & (wanted * rough.speed.max() < _BAND * rate)
     strongest = np.argsort(-np.where(kept, rough.evidence, -np.inf))[:_MOST_ORDERS]
     used = wanted[np.sort(strongest)][kept[np.sort(strongest)]]
@@ -130,8 +128,7 @@ def _orders(orders: Sequence[float] | None, machine: Machine | None) -> FloatArr
         if not isinstance(machine, Machine):
             raise ParameterError(f'machine is of type {type(machine).__name__}: give a Machine, '
                                  'Machine.read(path)')
-        orders = [order for name, order in machine.places().items()
-                  if name.startswith('mesh ') and name.endswith('x')]
+        orders = [*machine.meshes().values()]
     found = np.unique(np.round(numbers('orders', orders), 9))
     if not found.size or not np.all(np.isfinite(found)) or found[0] <= 0.0:
         raise ParameterError(f'orders are {found.tolist()}: give one or more, all above 0')

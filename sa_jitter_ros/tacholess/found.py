@@ -10,6 +10,7 @@
 
 """Pulses that were found without a tach: their errors, and what these do to an average."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
@@ -164,7 +165,7 @@ class FoundPulses:
             square += (size**2).mean(axis=0) / windows
             within = np.trace(errors) / len(errors) - errors.mean()
             inside += wanted**2 * within / windows
-        used = np.asarray(np.isclose(wanted[:, None], self.used, rtol=_SAME, atol=0.0).any(axis=1))
+        used = among(wanted, self.used)
         return ExpectedAmplitudes(
             wanted, mean, np.sqrt(np.maximum(square - mean**2, 0.0)),
             np.where(used, mean * np.exp(inside), mean), used)
@@ -209,6 +210,11 @@ class FoundPulses:
                     'free of bias: other orders were used'
                     for used in expected.used)
         return CorrectedAmplitudes(amplitudes, errors, expected, how)
+
+
+def among(orders: FloatArray, others: Sequence[float]) -> NDArray[np.bool_]:
+    """Return which orders (order,) are among others."""
+    return np.asarray(np.isclose(orders[:, None], others, rtol=_SAME, atol=0.0).any(axis=1))
 
 
 def _amplitudes(errors: FloatArray, orders: FloatArray, seed: int) -> FloatArray:

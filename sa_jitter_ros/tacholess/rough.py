@@ -138,8 +138,7 @@ def _require_one(track: _Track, speed: FloatArray, orders: FloatArray,
                           'orders that the vibration has, or a sensor nearer to their source')
     if track.other > (_AMBIGUOUS - _FEW / len(orders)**2) * track.total:
         raise SignalError(
-            f'two combs of the orders {_text(orders)} fit, at {np.median(speed):.4g} Hz and '
-            'at '
+            f'two combs of the orders {_text(orders)} fit, at {np.median(speed):.4g} Hz and at '
             f'{track.other_speed:.4g} Hz: narrow speed_range, or give more orders of the machine')
     edge = np.mean((track.path <= 1) | (track.path >= len(track.speeds) - 2))
     if edge > _AT_EDGE:
