@@ -237,8 +237,8 @@ def _parts(report: Report, expected: Expected) -> Iterator[str]:
     """Yield what is missing of the steps of a clock, lines that vary, and what was not tested."""
     steps = report.get('clock_steps') or ()
     for time, size in expected.steps:
-        if not any(abs(item['time'] - time) <= _CYCLES * expected.cycle and distance(
-                abs(item['step']), item['standard_error'], abs(size)) <= SURE for item in steps):
+        if not any(abs(item['time'] - time) <= _CYCLES * expected.cycle
+                   and _sized(item, size) for item in steps):
             yield f'no step of the clock by {size:.3g} s at {time:.2f} s, but {list(steps)}'
     if not expected.steps and steps:
         yield f'steps of the clock that are not there: {list(steps)}'
@@ -254,6 +254,14 @@ def _parts(report: Report, expected: Expected) -> Iterator[str]:
             yield 'not_testable does not say what could not be compared'
     if expected.against and report['against'] != expected.against:
         yield f'compared against the {report["against"]}, not the {expected.against}'
+
+
+def _sized(step: Mapping[str, Any], size: float) -> bool:
+    """Whether a step of the clock is of a `size` (s, signed), or whole periods from it."""
+    size -= step['step']
+    if step['period'] is not None:
+        size = math.remainder(size, step['period'])
+    return distance(0.0, step['standard_error'], size) <= SURE
 
 
 def _words(answer: Answer, expected: Expected) -> Iterator[str]:

@@ -43,6 +43,7 @@ FOREIGN: Mapping[str, tuple[str, ...]] = {
     'target_geometry': ('enc36',),
     'path_delay': ('runup',)}
 _MARKS, _PER_TURN = 12, 3  # of the 36 marks of a target, and trigger cycles a revolution
+_SLIP = 0.47  # of a recording, behind which the source has slipped
 _NO_MODULE = 'hum', 'backlash', 'slip', 'own_phase', 'bursts'
 
 
@@ -86,6 +87,12 @@ def foreign(seed: int, effect: str = '', kinds: tuple[str, ...] = KINDS, lost: i
               **{key: model[key] for key in (
                   'ratio', 'pulses_per_revolution', 'pulses_per_trigger')}}
     expected = _of_foreign(effect, size)
+    if effect == 'slip':  # of the source by an angle, which is at one speed as a step of the clock
+        at = _SLIP * made['vib'].shape[1] / made['fs']
+        marks, here = model['pulses_per_revolution'], np.searchsorted(made['pulses'], at)
+        revolutions = np.ptp(made['pulses'][[here - marks, here + marks]]) / 2.0
+        expected = replace(expected, cycle=1.0 / made['trig'], steps=(
+            (at, size['size'] * revolutions / model['ratio']),))
     if lost:
         at = int(made['vib'].shape[1] * rng.uniform(0.35, 0.65))
         fields['vibration'] = np.delete(made['vib'], slice(at, at + lost), axis=1)

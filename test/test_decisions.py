@@ -107,12 +107,16 @@ def test_declared_changes_hold_noise_and_ticks():
 
 
 def test_steps_of_the_clock_and_unsteady_lines_are_looked_for():
-    wanted = {'verdicts': ('unexplained',), 'steps': ((9.0, 4e-4),), 'cycle': 0.05,
+    wanted = {'verdicts': ('unexplained',), 'steps': ((9.0, -4e-4),), 'cycle': 0.05,
               'unsteady': ((23.0, 'outer'),)}
-    step = {'time': 9.08, 'step': -3.9e-4, 'standard_error': 1e-5}
+    step = {'time': 9.08, 'step': -3.9e-4, 'standard_error': 1e-5, 'period': None}
+    aliased = {**step, 'step': 6.1e-4, 'period': 1e-3}
     line = {'order': 23.0, 'channel': 'outer', 'scatter': 0.1}
     assert judged(report('unexplained', clock_steps=[step], unsteady_lines=[line]), **wanted).right
+    assert judged(report('unexplained', clock_steps=[aliased], unsteady_lines=[line]),
+                  **wanted).right
     for change in ({'clock_steps': []}, {'clock_steps': [{**step, 'time': 9.2}]},
+                   {'clock_steps': [{**aliased, 'period': None}]},
                    {'unsteady_lines': [{**line, 'channel': 'inner'}]}):
         found = judged({**report('unexplained', clock_steps=[step], unsteady_lines=[line]),
                         **change}, **wanted)

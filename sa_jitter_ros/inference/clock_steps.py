@@ -47,13 +47,16 @@ class ClockStep:
     Pulses are late by `step` (s) more from `time` (s) on, with its `standard_error`.
 
     `pulse` is the first of them among all trigger pulses, interpolated ones included. Lost samples
-    of the vibration make pulses late, lost time of the keyphasor early.
+    of the vibration make pulses late, lost time of the keyphasor early. Steps that differ by a
+    multiple of `period` (s), shorter than a trigger cycle, turn all lines alike; None where no
+    other step does.
     """
 
     pulse: int
     time: float
     step: float
     standard_error: float
+    period: float | None
 
 
 def clock_steps(reader: CycleReader, pulses: RecordPulses, stretches: Sequence[slice],
@@ -70,10 +73,10 @@ def clock_steps(reader: CycleReader, pulses: RecordPulses, stretches: Sequence[s
         phasors = _Phasors.read(reader, pulses.bridged[part], model)
         edges = [0, phasors.count]
         while len(found) < _MOST and (step := _clearest(phasors, edges)) is not None:
-            at, size, error = step
+            at, size, error, period = step
             pulse = part.start + at + 1  # the step is inside cycle `at`
             found.append(ClockStep(pulse, float(np.mean(pulses.bridged[pulse - 1:pulse + 1])),
-                                   size, error))
+                                   size, error, period))
             edges = sorted([*edges, at])
     return tuple(sorted(found, key=lambda item: item.pulse))
 
@@ -83,9 +86,11 @@ def steps_text(steps: Sequence[ClockStep]) -> str:
     first = steps[0]
     size = measured_text(abs(first.step), first.standard_error, 's')
     way = 'late' if first.step > 0.0 else 'early'
+    other = (f' (or that and any multiple of {first.period:.4g} s, which turns the declared '
+             'orders alike)' if first.period else '')
     more = f', and at {len(steps) - 1} later times' if len(steps) > 1 else ''
     return (f'from {first.time:.6g} s on the pulses are {size} too {way} against the vibration'
-            f'{more}, as lost samples or a slipping shaft make them')
+            f'{other}{more}, as lost samples or a slipping shaft make them')
 
 
 def broken_at_steps(pulses: RecordPulses, steps: Sequence[ClockStep]) -> RecordPulses:
@@ -102,10 +107,11 @@ class _Phasors:
     Sums of the phasors of consecutive trigger cycles, over the root of their noise.
 
     `total` (cycle + 1, line) is that of all cycles before; `turns` (delay, line) are what the
-    `delays` (delay,) in s, shortest first, turn the lines by.
+    `delays` (delay,) in s, shortest first, turn the lines of `frequency` (line,) in Hz by.
     """
 
     total: Array
+    frequency: Array
     delays: Array
     turns: Array
 
@@ -133,7 +139,8 @@ class _Phasors:
         reach = math.floor(0.5 * model.trigger_period / step)
         delays = step * np.arange(-reach, reach + 1)
         delays = delays[np.argsort(np.abs(delays), kind='stable')]
-        return cls(lines, delays, np.exp(-2j * np.pi * np.multiply.outer(delays, frequency)))
+        turns = np.exp(-2j * np.pi * np.multiply.outer(delays, frequency))
+        return cls(lines, frequency, delays, turns)
 
     def delay(self, before: tuple[int, int], after: tuple[int, int]) -> float:
         """Return by how much pulses of the cycles `after` are late against those `before`, s."""
@@ -148,6 +155,17 @@ class _Phasors:
         off = top_between(likely[near]) if low + high < 2.0 * middle else 0.0
         return float(self.delays[near[1]] + off * (self.delays[near[1]] - self.delays[near[0]]))
 
+    def period(self, before: tuple[int, int], after: tuple[int, int]) -> float | None:
+        """Return the shortest step in s, below a trigger cycle, that turns no line."""
+        weight = np.abs(self._both(before, after))
+        step = 0.25 / (_FINE * float(self.frequency.max()))
+        steps = step * np.arange(math.ceil(2.0 * float(self.delays.max()) / step))
+        alike = np.cos(2.0 * np.pi * np.multiply.outer(steps, self.frequency)) @ weight
+        edges = np.flatnonzero(np.diff(alike >= _EVEN * weight.sum())) + 1
+        if edges.size < 3:  # the first falls from the steps of nearly no size
+            return None
+        return float(steps[edges[1] + int(np.argmax(alike[edges[1]:edges[2]]))])
+
     def likelihood(self, at: int, beside: int, delay: float) -> float:
         """Return how well a `delay` (s) in cycle `at` fits some cycles on either side."""
         likely = (self.turns @ self._both((at - beside, at), (at + 1, at + 1 + beside))).real
@@ -159,8 +177,9 @@ class _Phasors:
         return np.asarray(early.conj() * late)
 
 
-def _clearest(phasors: _Phasors, edges: Sequence[int]) -> tuple[int, float, float] | None:
-    """Return in which cycle the clearest step is, its size in s, and what that errs by."""
+def _clearest(phasors: _Phasors,
+              edges: Sequence[int]) -> tuple[int, float, float, float | None] | None:
+    """Return in which cycle the clearest step is, its size, what that errs by, its period."""
     places, delays = [], []
     for low, high in pairwise(edges):
         beside = min(_BESIDE, (high - low) // 3)
@@ -182,8 +201,9 @@ def _clearest(phasors: _Phasors, edges: Sequence[int]) -> tuple[int, float, floa
              key=lambda place: phasors.likelihood(place, _FEWEST, size + usual))
     first, last = max(edge for edge in edges if edge <= at), min(
         edge for edge in edges if edge > at)
-    size = phasors.delay((max(first, at - 2 * _BESIDE), at),
-                         (at + 1, min(last, at + 1 + 2 * _BESIDE))) - usual
+    sides = (max(first, at - 2 * _BESIDE), at), (at + 1, min(last, at + 1 + 2 * _BESIDE))
+    size = phasors.delay(*sides) - usual
     sudden = all(phasors.likelihood(at, _SUDDEN, size + usual) > phasors.likelihood(
         at, _SUDDEN, part * size + usual) for part in (0.0, 0.5))
-    return (at, size, error) if sudden and abs(size) > _CLEAR * error else None
+    clear = sudden and abs(size) > _CLEAR * error
+    return (at, size, error, phasors.period(*sides)) if clear else None

@@ -93,7 +93,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'verdict': trace.verdict,
         'remains': trace.remains,
         'clock_steps': [{'time': item.time, 'step': item.step,
-                         'standard_error': item.standard_error}
+                         'standard_error': item.standard_error, 'period': item.period}
                         for item in observation.clock_steps],
         'unsteady_lines': [{**asdict(item), 'name': observation.name_of(item.order)}
                            for item in trace.unsteady],
