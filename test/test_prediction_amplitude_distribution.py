@@ -12,11 +12,14 @@
 
 import numpy as np
 import pytest
+from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
+from sa_jitter_ros.prediction.amplitudes import unit_amplitudes
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import average_cumulants, third_cumulants
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments
 from sa_jitter_ros.prediction.parts import Parts
 from sa_jitter_ros.prediction.sampled_distribution import (
@@ -206,3 +209,23 @@ def test_laguerre_density_is_the_derivative_of_its_cdf():
     slope = np.diff(distribution.cdf(x)[0]) / np.diff(x)
     np.testing.assert_allclose(slope, distribution.pdf(0.5 * (x[1:] + x[:-1]))[0], atol=1e-6)
     assert distribution.cdf([0.0, 50.0])[0] == pytest.approx([0.0, 1.0], abs=1e-9)
+
+
+@pytest.mark.parametrize('setting', [
+    {'trigger_cycles': 4}, {'trigger_cycles': 20}, {'trigger_cycles': 4, 'noise': 0.3},
+    {'trigger_cycles': 6, 'pulses_per_revolution': 4, 'pulses_per_trigger': 1,
+     'effects': [make_effect('target_geometry', pulse_angles=[0.02, -0.05, 0.05, -0.02])]}])
+@pytest.mark.parametrize('most', [512, 4096])
+def test_part_of_the_draws_has_the_distribution_of_all(setting, most):
+    setting = dict(setting)
+    effects, noise = setting.pop('effects', []), setting.pop('noise', 0.0)
+    model = DeclaredModel(keyphasor_rate=2000.0, trigger_speed=16.6, ratio=2.4,
+                          orders=[19.0, 57.0], **setting)
+    found, rows = unit_amplitudes(model, effects), np.arange(2)
+    whole, part = (found.distribution(rows, noise=noise, most=count) for count in (None, most))
+    assert part.draws.shape[1] == most < whole.draws.shape[1]
+    random = most**-0.5
+    np.testing.assert_allclose(part.mean, whole.mean, atol=0.2 * random)
+    np.testing.assert_allclose(part.variance**0.5, whole.variance**0.5, rtol=1.5 * random)
+    share = [0.05, 0.5, 0.95]
+    np.testing.assert_allclose(part.cdf(whole.ppf(share)), [share] * 2, atol=random)

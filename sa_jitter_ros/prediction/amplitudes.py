@@ -22,6 +22,7 @@ moments are then exact for lost pulses alone, and those of the draws elsewhere.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+import math
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,7 @@ _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
 #: Scenarios of an influence, and of several together.
 SCENARIOS = 256
 _SEED = 11  # of which combinations
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # steps of so much are even, and so is any part of them
 _DRAWS, _FEWEST = 8192, 64  # evenly spread values in all scenarios, in one
 _SCENARIO_NODES = 32  # as `scenario_moments` takes at most
 _WORK = 20_000_000_000  # multiplications of phasors, about a second
@@ -98,7 +100,9 @@ class Amplitudes:
         rows = np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)
         if self.draws is not None:
-            return self._sampled(self.draws[rows, :most], self.parts.of((rows,)), shift, noise)
+            every = -(-self.draws.shape[1] // (most or self.draws.shape[1]))
+            step = 1 << (every - 1).bit_length()  # of a lattice, such points are one, too
+            return self._sampled(self.draws[rows, ::step], self.parts.of((rows,)), shift, noise)
         count = len(self.each.mean)
         curved = self._curved((slice(None), rows), shift, noise)
         if count == 1:
@@ -131,7 +135,7 @@ class Amplitudes:
         turn = parts.direction * whole.direction.conj()
         return distribution_of(
             draws * turn[..., None]
-            + np.sqrt(noise)[..., None] * self.noise[:draws.shape[1]], whole)
+            + np.sqrt(noise)[..., None] * self.noise[::self.noise.size // draws.shape[-1]], whole)
 
 
 def component_gain(model: DeclaredModel, influences: Sequence[Influence]) -> Array:
@@ -336,7 +340,8 @@ def _with_draws(found: Amplitudes, model: DeclaredModel, processes: Sequence[Ang
                 gain: Array, errors: Array | None = None, *, apart: bool = False) -> Amplitudes:
     """Return the amplitudes with draws, in each scenario as many where they are kept `apart`."""
     cycles = None if errors is None else errors * model.fundamental_frequency
-    known = None if apart or cycles is None else lambda n: cycles[np.arange(n) % len(cycles)]
+    known = None if apart or cycles is None else lambda n: cycles[
+        (len(cycles) * (_GOLDEN * np.arange(n) % 1.0)).astype(int)]
     draws, noise = drawn_averages(model.orders, processes, model.trigger_cycles, known=known,
                                   weights=model.weights, each=cycles if apart else None,
                                   spread=max(model.orders) * angle_spread(processes))
