@@ -72,6 +72,7 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.amplitude_errors import widened
 from sa_jitter_ros.averaging.jackknife import jackknife_variance, PARTS, WaveformParts
 from sa_jitter_ros.errors import ParameterError, SignalError
+from scipy.fft import ifft, next_fast_len
 
 Array = NDArray[Any]
 
@@ -540,9 +541,10 @@ def _mesh_envelope(spectrum: Array, points: int, settings: GearSettings) -> Arra
         return np.full((*spectrum.shape[:-1], 1), np.nan)
     mesh = min(int(order) for order in settings.mesh_orders)
     reach = min(mesh // 2, mesh - 1, (points - 1) // 2 - mesh)
-    band = np.zeros((*spectrum.shape[:-1], _ENVELOPE_POINTS * (2 * reach + 1)), complex)
+    count = next_fast_len(_ENVELOPE_POINTS * (2 * reach + 1))
+    band = np.zeros((*spectrum.shape[:-1], count), complex)
     band[..., :2 * reach + 1] = spectrum[..., mesh - reach:mesh + reach + 1]
-    return np.asarray(np.abs(np.fft.ifft(band)) * (2.0 * band.shape[-1] / points))
+    return np.asarray(np.abs(ifft(band)) * (2.0 * count / points))
 
 
 class _Reference:
