@@ -29,9 +29,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
 
-#: Relative spread of speeds below which they count as one speed.
-SAME_SPEED = 5e-3
-
 
 @dataclass(frozen=True)
 class Tone:

@@ -18,7 +18,6 @@ from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.expectation import Memory
-from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
     channel_groups, choose_lines, gather_pulses, hidden_lines, line_evidence)
 from sa_jitter_ros.inference.observation import Observation
@@ -41,12 +40,12 @@ def make_bench(observation: Observation, observations: Sequence[Observation],
     orders = observation.orders.size
     corrected = np.abs(observation.stacked('corrected')[list(fit), ..., :orders]).mean(axis=0)
     hidden = hidden_lines(observation, lines)
-    bench = with_fewer_cycles(Bench(
+    bench = Bench(
         observation, lines, lines.of(corrected), [row for _, rows in known for row in rows], clock,
-        group, line_evidence(observation, lines), fit, held_out, tuple(declared)))
+        group, line_evidence(observation, lines), fit, held_out, tuple(declared))
     if hidden.count:
         bench = replace(bench, hidden=replace(
-            bench, lines=hidden, level=hidden.of(corrected), memory=Memory(), fewer=None))
+            bench, lines=hidden, level=hidden.of(corrected), memory=Memory()))
     return bench.with_moving_source(())
 
 

@@ -130,8 +130,7 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
         float(rises @ rises), np.finfo(np.float64).tiny)
     return (_turns(observation, ratio, noise, order, run.size - int(run.max()) - 1),
             _turns_in_cycles(observation, lines),
-            *_follows(observation, np.abs(ratio), noise),
-            *_beside_errors(observation, lines, noise))
+            *_follows(observation, np.abs(ratio), noise))
 
 
 def _runs(observation: Observation) -> tuple[Array, Array]:
@@ -237,41 +236,3 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
                   math.sqrt(float(explained[worst])),
                   f'the amplitudes follow the speed: {math.sqrt(float(explained[worst])):.2g} of '
                   'an amplitude RMS, as a resonance makes them'),)
-
-
-def _beside_errors(observation: Observation, lines: Lines, noise: Array) -> Iterator[Check]:
-    """
-    Test whether the amplitudes of an order follow the pulse errors, as a parabola over them.
-
-    Where one order shows the errors alone, what turns it looks like them; a resonance or a path
-    that changes its amplitude, too, is told by that. Two motions shifted far against each other
-    tell how much slow ones agree by chance. Of the `noise` (line,) of the averages the amplitudes
-    share with the errors at most what these have of noise.
-    """
-    cycles = np.abs(lines.of(cycle_amplitudes(observation)))
-    count = cycles.shape[1]
-    errors = np.concatenate([0.5 * (row[1:] + row[:-1])[:count] for row in _errors(observation)])
-    known = np.isfinite(errors)
-    spread = max(float(np.std(errors[known])), np.finfo(np.float64).tiny)
-    errors = errors[known] / spread
-    unsure = np.nanmean(observation.stacked('standard_errors') ** 2) / spread**2
-    shared_noise = cycles.shape[1] * min(float(unsure), 1.0) * noise**2
-    shape = np.linalg.qr(np.stack(
-        [np.ones(errors.size), errors, errors**2], axis=1))[0][:, 1:]
-    waves = np.fft.rfft(shape, axis=0)
-    size = (cycles / cycles.mean(axis=(0, 1))).reshape(known.size, -1)[known]
-    orders = np.unique(lines.order)
-    for order in orders:
-        values = size[:, lines.order == order].mean(axis=1)
-        values -= values.mean()
-        shared = np.fft.irfft(waves * np.fft.rfft(values).conj()[:, None], errors.size, axis=0)
-        explained = np.sum(shared**2, axis=1) / errors.size
-        share = explained / np.var(values)
-        apart = share[errors.size // 4:-(errors.size // 4)].mean()
-        if explained[0] > _TURN**2 + shared_noise[lines.order == order].mean():
-            # the share of a parabola over independent values is 2 / (their number - 1) in the mean
-            yield Check(min(1.0, float((1.0 - share[0]) ** max(1.0 / apart - 1.0, 0.0))
-                            * orders.size), LINES, math.sqrt(float(explained[0])),
-                        f'the amplitude of {observation.words(observation.orders[order])} '
-                        f'follows the pulse errors: {math.sqrt(float(explained[0])):.2g} of it '
-                        'RMS, as a resonance or a path that changes make it')

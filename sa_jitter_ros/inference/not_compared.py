@@ -92,7 +92,7 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     left_over = unexplained_text(observation, most, harmful, unsteady)
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
-        tuple(present), tuple(without_harmful(tried, harmful)), UNDEFINED, UNDEFINED, (), (),
+        tuple(present), tuple(without_harmful(tried, harmful)), UNDEFINED, UNDEFINED,
         np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None,
         'unexplained' if left_over else 'traced' if found else 'none', float('nan'),
         None, None, rows, undecided,

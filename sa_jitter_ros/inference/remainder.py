@@ -18,7 +18,6 @@ from sa_jitter_ros.effects.effect import effects_of, Finding
 from sa_jitter_ros.effects.timing import Pattern, PULSES
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.clock_steps import steps_text
-from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.gate import HeldOut
 from sa_jitter_ros.inference.line_checks import check_channels, check_gain, check_lines
 from sa_jitter_ros.inference.observation import Observation
@@ -45,8 +44,6 @@ class Scores:
     unsteadiness: float
     before: Residual
     after: Residual
-    moves_before: tuple[Dependence, ...]
-    moves_after: tuple[Dependence, ...]
 
 
 def scored(bench: Bench, chosen: Sequence[Finding]) -> Scores:
@@ -54,11 +51,9 @@ def scored(bench: Bench, chosen: Sequence[Finding]) -> Scores:
     effects = effects_of(chosen)
     bench = bench.with_moving_source(effects)
     own = bench.unsteadiness(effects)
-    before, moves = bench.score((), unsteadiness=own), dependences(bench, (), ())
-    if not chosen:
-        return Scores(bench, own, before, before, moves, moves)
-    return Scores(bench, own, before, bench.score(effects, chosen, unsteadiness=own), moves,
-                  dependences(bench, effects, chosen))
+    before = bench.score((), unsteadiness=own)
+    return Scores(bench, own, before, bench.score(
+        effects, chosen, unsteadiness=own) if chosen else before)
 
 
 def predicting(bench: Bench, own: float) -> Callable[[Sequence[Finding]], HeldOut]:
@@ -71,7 +66,7 @@ def without_absorbing(scores: Scores, left: Check | None, chosen: list[Finding],
                       ) -> tuple[list[Finding], list[Candidate]]:
     """Return the effects that do not merely absorb a part of what is left, and the candidates."""
     of_timing = left.text if left is not None else ''
-    if left is None and remains(scores.after, scores.moves_after):
+    if left is None and scores.after.significant:
         of_timing = _little_is_gained(chosen, scores.before, scores.after)
     of_lines = _SCATTER if left is None and scores.after.p_amplitude < FALSE_ALARM else ''
     if not (of_timing or of_lines):
@@ -130,18 +125,10 @@ def unexplained_check(bench: Bench, timing: Timing | None, chosen: Sequence[Find
     return min(left, key=lambda check: check.p_value, default=None)
 
 
-def remains(left: Residual, moves: Sequence[Dependence]) -> bool:
-    """Return whether a residual or one of its dependences is significant."""
-    return left.p_value < FALSE_ALARM or moving(moves) is not None
-
-
 def surest_text(left: Check | None, scores: Scores, unsteady: Sequence[UnsteadyLine]) -> str:
     """Return the surest of what is left; lines that vary say it better than their scatter."""
     if left is not None:
         return left.text
-    moves = moving(scores.moves_after)
-    if moves is not None:
-        return str(moves)
     said = scores.after.of_amplitude and any(item.large for item in unsteady)
     return '' if said else scores.after.text
 

@@ -94,6 +94,11 @@ class Residual:
         return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude_scatter)
 
     @property
+    def significant(self) -> bool:
+        """Return whether something is not as predicted."""
+        return self.p_value < FALSE_ALARM
+
+    @property
     def of_amplitude(self) -> bool:
         """Return whether the scatter of the amplitude is the surest of what is not predicted."""
         return self.p_amplitude_scatter <= min(self.p_mean, self.p_scatter)

@@ -42,27 +42,13 @@ _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """
-    Residual of the attenuation and its `scale`, (acquisition, line).
-
-    `moved` is the change of the prediction by one standard error of each fitted parameter.
-    """
-
-    difference: Array
-    scale: Array
-    moved: tuple[Array, ...]
-
-
-@dataclass(frozen=True)
 class Bench:
     """
     What scoring needs; `unidentifiable` maps effects to why these data cannot show them.
 
-    `fewer` is the bench of averages of fewer cycles, if the acquisitions have enough of them,
-    `hidden` that of declared orders that the vibration holds and that are not worth comparing.
-    `moving` are effects that take as much from the amplitude with a reference keyphasor as from
-    the raw one.
+    `hidden` is the bench of declared orders that the vibration holds and that are not worth
+    comparing. `moving` are effects that take as much from the amplitude with a reference keyphasor
+    as from the raw one.
     """
 
     observation: Observation
@@ -77,7 +63,6 @@ class Bench:
     declared: tuple[Effect, ...]
     unidentifiable: Mapping[str, str] = field(default_factory=dict)
     memory: Memory = field(default_factory=Memory, repr=False)
-    fewer: 'Bench | None' = None
     hidden: 'Bench | None' = None
     moving: tuple[Effect, ...] = ()
 
@@ -86,8 +71,7 @@ class Bench:
         if not self.observation.against_reference:
             return self
         moving = tuple(item for item in self.with_declared(effects) if item.pulse_times_correct)
-        return replace(self, moving=moving,
-                       fewer=self.fewer and self.fewer.with_moving_source(effects))
+        return replace(self, moving=moving)
 
     @property
     def assumed(self) -> Sequence[Effect]:
@@ -107,7 +91,6 @@ class Bench:
             return self
         model = replace(self.observation.model, noise_std=std)
         return replace(self, observation=replace(self.observation, model=model), memory=Memory(),
-                       fewer=self.fewer and self.fewer.with_noise(std),
                        hidden=self.hidden and self.hidden.with_noise(std))
 
     def without(self, name: str) -> 'Bench':
@@ -118,7 +101,6 @@ class Bench:
     def declaring(self, effects: Sequence[Effect]) -> 'Bench':
         """Return the bench of a model that declares some more effects."""
         return replace(self, declared=(*self.declared, *effects),
-                       fewer=self.fewer and self.fewer.declaring(effects),
                        hidden=self.hidden and self.hidden.declaring(effects))
 
     def with_declared(self, effects: Sequence[Effect]) -> list[Effect]:
@@ -208,15 +190,6 @@ class Bench:
         model = replace(self.observation.model, jitter_distribution='table', jitter_table=(0.0,))
         return expect(replace(self.observation, model=model), self.lines, self.level, effects,
                       self.pulses, self.group, chosen)
-
-    def compare(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Comparison:
-        """Return the residual of the attenuation of the held-out acquisitions, one by one."""
-        attenuation, variance, _ = self.observed(self.held_out)
-        expected = self.expect(effects, self.held_out)
-        return Comparison(
-            attenuation - expected.attenuation, np.sqrt(expected.attenuation_variance + variance),
-            tuple(self.expect(others, self.held_out).attenuation - expected.attenuation
-                  for others, scatters in self._moved(effects, findings) if not scatters))
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:

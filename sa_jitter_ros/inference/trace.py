@@ -39,7 +39,7 @@ from sa_jitter_ros.inference.not_compared import nothing_compared, too_unsure, u
 from sa_jitter_ros.inference.observation import CHANCE, Observation, together
 from sa_jitter_ros.inference.refinements import with_its_noise, with_its_ticks
 from sa_jitter_ros.inference.remainder import (
-    predicting, remains, scored, SPEED, surest_text, unexplained_check, unexplained_text,
+    predicting, scored, SPEED, surest_text, unexplained_check, unexplained_text,
     without_absorbing, without_harmful)
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
@@ -171,7 +171,7 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     evidence = bench.gather((), everything)
     scores = scored(bench, chosen)
     left = unexplained_check(scores.bench, whole, chosen)
-    significant = left is not None or remains(scores.after, scores.moves_after)
+    significant = left is not None or scores.after.significant
     certain, candidates = without_absorbing(scores, left, chosen, candidates)
     scores = scores if len(certain) == len(chosen) else scored(bench, certain)
     chosen, harmful, gained = passed(certain, predicting(scores.bench, scores.unsteadiness))
@@ -189,7 +189,7 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         final[:len(chosen)], final[len(chosen):len(chosen) + len(present)], tuple(candidates),
-        scores.before, scores.after, scores.moves_before, scores.moves_after, attenuation,
+        scores.before, scores.after, attenuation,
         amplitude, scores.bench.expect((), everything, unsteadiness=own),
         scores.bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if left_over else 'traced' if chosen else 'none', own, timing, left,

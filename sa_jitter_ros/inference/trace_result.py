@@ -20,7 +20,6 @@ from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, NO_CLOCK
 from sa_jitter_ros.inference.candidates import Candidate
-from sa_jitter_ros.inference.dependence import Dependence
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.gate import NO_GAIN, ScoreGain
 from sa_jitter_ros.inference.limits import EffectLimit
@@ -42,7 +41,6 @@ class Trace:
     The parameters of `findings` and `present` fit all acquisitions; residuals and predictions are
     those of parameters that fit the others.
 
-    `dependences_before` and `dependences_after` are their changes with order, speed and cycles.
     `prediction_before` and `prediction_after` are predictions for all acquisitions
     (acquisition, line) of the `lines`, `attenuation` and `amplitude` the observed values.
     `evidence` is that of the first round, less declared effects only. `unsteadiness` is the
@@ -68,8 +66,6 @@ class Trace:
     candidates: tuple[Candidate, ...]
     before: Residual
     after: Residual
-    dependences_before: tuple[Dependence, ...]
-    dependences_after: tuple[Dependence, ...]
     attenuation: Array
     amplitude: Array
     prediction_before: Expectation

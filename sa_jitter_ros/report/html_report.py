@@ -150,8 +150,6 @@ def _evidence(content: Mapping[str, Json]) -> Iterator[str]:
         if content['missing_effects']:
             yield part('Effects that are missing', *_effects(content))
         yield part('Error of the averages that served no fit', _error_table(content))
-        yield part('Dependence of the residual on other quantities',
-                   _dependence_table(content['dependence']))
         yield part('All effects that were tried', _candidate_table(content['candidates']))
         yield part('What an effect that was not found could be at most', _limit_table(content))
         yield part('All lines', _line_table(content))
@@ -174,15 +172,6 @@ def _error_table(content: Mapping[str, Json]) -> str:
         *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
         ('unsteadiness: unexplained scatter of the amplitudes, which chi2 takes into account',
          *2 * (percent_text(content['unsteadiness']),))])
-
-
-def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
-    return table(
-        ('over', 'from', 'to', 'change of the residual, before', 'after'),
-        [(item['on'].replace('_', ' '), number_text(item['low']),
-          measured_text(item['high'], None, item['unit']),
-          *(measured_text(item[when]['change'], item[when]['standard_error'])
-            for when in ('before', 'after'))) for item in rows], kind='cards')
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:

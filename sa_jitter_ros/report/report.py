@@ -24,7 +24,6 @@ from sa_jitter_ros.effects.effect import departs, Finding, same
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.inference.candidates import Candidate
-from sa_jitter_ros.inference.dependence import Dependence
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.json_values import json_values
@@ -87,8 +86,6 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'error_after': errors(trace.after),
         'error_as_declared': errors(trace.as_declared),
         'gain': asdict(trace.gain),
-        'dependence': [_dependence(*pair) for pair in zip(
-            trace.dependences_before, trace.dependences_after)],
         'unsteadiness': trace.unsteadiness,
         'verdict': trace.verdict,
         'remains': trace.remains,
@@ -173,13 +170,6 @@ def _not_compared(trace: Trace) -> Sequence[str]:
     names = ', '.join(trace.observation.words(order) for order in orders[without])
     return [f'{names} is declared but not compared: on no channel is its phase as constant from '
             'cycle to cycle as that of the other lines'] * bool(names)
-
-
-def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
-    return {'on': before.on, 'unit': before.unit, 'low': before.low, 'high': before.high,
-            **{when: {'change': item.change, 'standard_error': item.standard_error,
-                      'p_value': None}
-               for when, item in (('before', before), ('after', after))}}
 
 
 def _changes(trace: Trace) -> list[Mapping[str, Json]]:
