@@ -102,7 +102,7 @@ class ClockSkew(Effect):
         known = np.flatnonzero(np.isfinite(pulses.times))
         begin, end = (known[0], known[-1]) if known.size else (0, 0)
         before = model.trigger_period * pulses.index[begin]
-        delay = self.skew * (before + pulses.times - pulses.times[begin])
+        delay = self._of_measured * (before + pulses.times - pulses.times[begin])
         by_time = delay * pulses.relative_speed - delay[begin]
         if begin == end:
             return np.asarray(by_time)
@@ -110,13 +110,19 @@ class ClockSkew(Effect):
         by_angle = (delay[end] - delay[begin]) * number / number[end]
         return np.asarray(by_time + self.by_angle * (by_angle - by_time))
 
+    @property
+    def _of_measured(self) -> float:
+        """Return the delay in a second of the keyphasor's clock, in s."""
+        return self.skew / (1.0 + self.skew)
+
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting
                   ) -> tuple['ClockSkew', Mapping[str, Any]]:
-        """Return the skew that delays a pulse by some units more every trigger period."""
-        skew = setting.unit / setting.model.trigger_period
-        return cls(skew * float(sizes[0])), {'skew': skew * float(np.sqrt(errors[0, 0]))}
+        """Return the skew that delays a pulse by some units more every measured period."""
+        unit = setting.unit / setting.model.trigger_period
+        rest = 1.0 - unit * float(sizes[0])
+        return cls(1.0 / rest - 1.0), {'skew': unit * float(np.sqrt(errors[0, 0])) / rest**2}
 
     def in_timing(self, setting: Setting) -> Array:
-        """Return the units by which a pulse comes later every trigger period."""
-        return np.array([self.skew * setting.model.trigger_period / setting.unit])
+        """Return the units by which a pulse comes later every measured period."""
+        return np.array([self._of_measured * setting.model.trigger_period / setting.unit])
