@@ -43,6 +43,8 @@ _TABLE_NODES, _SPREADS = (_NODES, 12, 24), (0.4, 0.75)
 _CLEAR = 8.0  # variance of a cycle over its squared mean
 _MOST_BLOCKS = 64
 _PAIR_NODES = 32
+# Places in a cycle whose phasors superpose, and of all that meet; share of the variance forgotten.
+_INSIDE, _MOST_INSIDE, _FORGOTTEN = 3, 400, 1e-3
 
 
 def third_cumulants(
@@ -128,6 +130,64 @@ def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Arr
     return unmixed * factor * m**2, mixed * factor * size**2
 
 
+def _superposed(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+                cycles: CycleMoments) -> tuple[Array, Array]:
+    """
+    Return the same, of the phasors at places inside the cycles where the memory is not too long.
+
+    Pulses that remember each other turn the places of a cycle by different angles. The triples of
+    a place and two others around it are summed, each as often as it fits into the average.
+    """
+    memory = min(correlation_length(processes), trigger_cycles - 1)
+    known = np.abs(cycles.variance[:memory + 1])
+    reach = int(np.flatnonzero(np.any(known >= _FORGOTTEN * known[0], axis=1))[-1])
+    if (2 * reach + 1) * _INSIDE > _MOST_INSIDE:
+        return superposed_cumulants(cycles, trigger_cycles)
+    g = require_orders(orders)
+    clear = np.real(cycles.variance[0]) < _CLEAR * np.abs(cycles.mean) ** 2
+    u, w = unit_nodes(_INSIDE)
+    mean = np.where(clear[:, None], joint_characteristic(
+        processes, [g[:, None]], [u], [0]), 1.0)
+    pair, conj = _pairs(g, processes, mean, u, reach)
+    place = np.arange(-reach, reach + 1)
+    span = (np.maximum(np.maximum.outer(place, place), 0)
+            - np.minimum(np.minimum.outer(place, place), 0))
+    often = np.kron(np.maximum(trigger_cycles - span, 0), np.ones((u.size, u.size)))
+    apart, middle = place - place[:, None] + 2 * reach, place + 2 * reach
+    found = np.zeros((2, g.size), complex)
+    for k in np.flatnonzero(clear).tolist():
+        weight = np.tile(w * mean[k], place.size)
+        first, other = (weight * item[k, middle].transpose(1, 0, 2).reshape(u.size, -1)
+                        for item in (pair, conj.conj()))
+        both, both_conj = (item[k, apart].transpose(0, 2, 1, 3).reshape(weight.size, -1)
+                           for item in (pair, conj))
+        own = w * mean[k]
+        for i, (a, b) in enumerate(zip(first, other)):
+            found[0, k] += own[i] * (a @ (often * (3.0 + both)) @ a)
+            found[1, k] += own[i] * (a @ (often * (2.0 + both_conj)) @ b.conj())
+            found[1, k] += own[i].conj() * (b @ often @ b)
+    return found[0] / trigger_cycles**3, found[1] / trigger_cycles**3
+
+
+def _pairs(g: Array, processes: Sequence[AngleErrorProcess], mean: Array, u: Array, reach: int
+           ) -> tuple[Array, Array]:
+    """
+    Return E[x y] and E[x conj(y)] over the means, less 1, for lags of y from -2 reach to 2 reach.
+
+    They are (order, lag, place of x, place of y), 0 for lags beyond `reach`.
+    """
+    found = np.zeros((2, g.size, 4 * reach + 1, u.size, u.size), complex)
+    for lag in range(reach + 1):
+        for item, sign, other in zip(found, (1.0, -1.0), (mean, mean.conj())):
+            value = joint_characteristic(
+                processes, [g[:, None, None], sign * g[:, None, None]], [u[:, None], u], [0, lag]
+                ) / (mean[:, :, None] * other[:, None]) - 1.0
+            back = value.transpose(0, 2, 1)
+            item[:, 2 * reach - lag] = back if sign > 0.0 else back.conj()
+            item[:, 2 * reach + lag] = value
+    return found[0], found[1]
+
+
 def average_cumulants(
     orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
     cycles: CycleMoments,
@@ -147,21 +207,21 @@ def average_cumulants(
     gains = [process for process in processes if hasattr(process, 'draw_gain')]
     spurious = (0.0, 0.0)
     if gains:
-        of_gains = superposed_cumulants(
-            cycle_moments(orders, gains, nodes=_PAIR_NODES), trigger_cycles)
+        of_gains = _superposed(orders, gains, trigger_cycles, cycle_moments(
+            orders, gains, nodes=_PAIR_NODES))
         spurious = (of_gains[0] * cycles.mean**3,
                     of_gains[1] * cycles.mean * np.abs(cycles.mean) ** 2)
     short = [process for process in near if process.correlation_length <= _REACH]
     if not short:
-        every = superposed_cumulants(cycles, trigger_cycles)
+        every = _superposed(orders, processes, trigger_cycles, cycles)
         return every[0] - spurious[0], every[1] - spurious[1]
     alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
     unmixed, mixed = _integrated(orders, short, trigger_cycles, alone)
     gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
     if len(short) == len(near):
         return unmixed * gain**3, mixed * gain * np.abs(gain) ** 2
-    every = superposed_cumulants(cycles, trigger_cycles)
-    close = superposed_cumulants(alone, trigger_cycles)
+    every = _superposed(orders, processes, trigger_cycles, cycles)
+    close = _superposed(orders, short, trigger_cycles, alone)
     return (every[0] - spurious[0] + (unmixed - close[0]) * gain**3,
             every[1] - spurious[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
 
