@@ -29,6 +29,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import Parts
 from sa_jitter_ros.prediction.prediction import predict
+from scipy.signal import lfilter
 
 TABLES = st.one_of(
     st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=40),
@@ -79,6 +80,49 @@ def test_predictions_are_those_of_drawn_averages(seed):
     setting, count = draw_setting(rng, most_cycles=60), 8000
     found = compare(setting, count, rng)
     assert not found.is_off(count), (setting, found)
+
+
+@pytest.mark.parametrize('seed', range(12))
+def test_predictions_with_effects_are_those_of_drawn_averages(seed):
+    """Pulses that remember each other, alternate or drift, of marks that are uneven."""
+    rng = np.random.default_rng([39, seed])
+    count, speed, order = 20_000, 20.0, 10.0
+    cycles, marks = int(np.exp(rng.uniform(0.0, np.log(120)))), int(rng.choice([1, 4]))
+    turn = np.exp(rng.uniform(np.log(0.05), np.log(2.0), 4)) / (2.0 * np.pi * order * speed)  # s
+    memory = float(rng.choice([-0.7, 0.3, 0.8]))
+    angles = turn[2] * 2.0 * np.pi * speed * np.array([1.0, -0.5, 0.5, -1.0])
+    effects = {
+        'correlated_jitter': {'std': turn[0], 'correlation': memory},
+        'excess_jitter': {'std': turn[1]},
+        'target_geometry': {'pulse_angles': np.clip(angles, -0.6, 0.6).tolist()},
+        'clock_skew': {'skew': min(turn[3] * speed / cycles, 5e-3)}}
+    chosen = rng.permutation([name for name in effects if marks > 1 or 'target' not in name])[:2]
+    shape = count, cycles + 1
+    errors = 0.3 * turn[1] * np.sqrt(12.0) * rng.uniform(-0.5, 0.5, shape)
+    white = rng.standard_normal(shape)
+    if 'excess_jitter' in chosen:
+        errors = errors + turn[1] * rng.standard_normal(shape)
+    if 'correlated_jitter' in chosen:
+        white[:, 1:] *= np.sqrt(1.0 - memory**2)
+        errors = errors + turn[0] * lfilter([1.0], [1.0, -memory], white, axis=1)
+    if 'target_geometry' in chosen:
+        first = rng.integers(0, marks, (count, 1))
+        errors = errors + np.clip(angles, -0.6, 0.6)[
+            (first + np.arange(cycles + 1)) % marks] / (2.0 * np.pi * speed)
+    if 'clock_skew' in chosen:
+        errors = errors + effects['clock_skew']['skew'] * np.arange(cycles + 1) / (marks * speed)
+    found = sa.predict(
+        keyphasor_rate=1.0 / (0.3 * turn[1] * np.sqrt(12.0)), trigger_speed=speed, orders=[order],
+        trigger_cycles=cycles, pulses_per_revolution=marks, pulses_per_trigger=1,
+        effects={name: effects[name] for name in chosen})
+    angle = np.pi * order * speed * errors
+    amplitude = np.abs(np.mean(np.exp(1j * (angle[:, 1:] + angle[:, :-1])) * np.sinc(
+        np.diff(angle, axis=1) / np.pi), axis=1))
+    assert found.mean_attenuation[0] == pytest.approx(
+        amplitude.mean(), abs=5.0 * amplitude.std() / np.sqrt(count) + 0.02 * amplitude.std())
+    assert found.standard_deviation[0] == pytest.approx(amplitude.std(), rel=0.05)
+    ranks = [np.mean(amplitude <= getattr(found, f'quantile_{q}')[0]) for q in ('05', '50', '95')]
+    np.testing.assert_allclose(ranks, [0.05, 0.5, 0.95], atol=0.022)
 
 
 @pytest.mark.parametrize('values', [

@@ -317,9 +317,14 @@ def _with_errors(model: DeclaredModel, processes: Sequence[AngleErrorProcess], e
     each = scenario_moments(model, processes, errors)
     cycles = cycle_moments(orders, processes, nodes=_SCENARIO_NODES, lags=count)
     unmixed, mixed = average_cumulants(orders, processes, count, cycles)
-    # A scenario turns the cycles' phasors apart and shortens their sum, skewness included.
-    share = each.mean / np.where(np.abs(cycles.mean) > 0.0, cycles.mean, 1.0)
-    parts = Parts.about(1.0, each, unmixed * share**3, mixed * share * np.abs(share) ** 2)
+    # A scenario turns the cycles' phasors apart: those of a triple are near each other.
+    cubes = np.zeros((2, *each.mean.shape), complex)
+    known = errors * model.fundamental_frequency
+    for k, order in enumerate(orders):
+        turn = np.exp(1j * np.pi * order * (known[:, 1:] + known[:, :-1])) * np.sinc(
+            order * np.diff(known, axis=1))
+        cubes[:, :, k] = np.mean(turn**3, axis=1), np.mean(turn * np.abs(turn) ** 2, axis=1)
+    parts = Parts.about(1.0, each, unmixed * cubes[0], mixed * cubes[1])
     return _of_parts(parts, gain), cycles
 
 
