@@ -12,7 +12,8 @@
 Keyphasor quantisation: pulse times on the grid of a clock, to which their errors are locked.
 
 A clock of the declared keyphasor rate is the cause of the declared jitter: its errors replace the
-independent ones. The errors of a clock of another rate are added. Errors of a steady machine
+independent ones. So do those of a slower clock, if the declared jitter is that of the rate. The
+errors of another clock are added. Errors of a steady machine
 repeat, p_{k+1} = p_k - T f mod 1, so that the mean over all starting phases need not be what one
 average shows: where pulses were measured, the prediction is made for their own phases.
 """
@@ -83,6 +84,12 @@ class KeyphasorQuantisation(Effect):
         return pulses.errors
 
     def replaces_jitter(self, model: DeclaredModel) -> bool:
+        """Return whether this clock is the declared one, or a slower one read in its place."""
+        slower = self.clock_rate < model.keyphasor_rate and not (
+            model.jitter_std or model.jitter_distribution == 'table')
+        return slower or self.is_declared(model)
+
+    def is_declared(self, model: DeclaredModel) -> bool:
         """Return whether this clock is the declared one."""
         return Clock(self.clock_rate, 0.0).same_as(model.keyphasor_rate)
 

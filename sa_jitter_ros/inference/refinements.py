@@ -50,7 +50,7 @@ def with_its_ticks(bench: Bench, chosen: list[Finding], present: list[Finding]
     """
     ticks = [item for item in (*chosen, *present)
              if isinstance(item.effect, KeyphasorQuantisation)
-             and item.effect.replaces_jitter(bench.observation.model)
+             and item.effect.is_declared(bench.observation.model)
              and item.name not in {effect.name for effect in bench.declared}]
     if not ticks:
         return bench, [], chosen, present

@@ -365,10 +365,11 @@ def _drawn(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: A
 
     def known(count: int) -> Array:
         total: Array = np.zeros(())
+        rng = np.random.default_rng(_SEED)
         for item, every in influences:
             rows = item.drawn_scenarios(model, count)
             if rows is None:
-                rows = every[np.random.default_rng(_SEED).integers(len(every), size=count)]
+                rows = every[rng.integers(len(every), size=count)]
             total = total + rows
         return total * model.fundamental_frequency
 
