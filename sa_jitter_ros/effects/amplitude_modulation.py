@@ -149,4 +149,4 @@ def _bandwidth_of(found: CommonGain, cycles: int) -> tuple[float, float]:
     low, bandwidth, high = np.exp(np.interp(
         [share + error, share, share - error], np.minimum.accumulate(shares)[::-1],
         np.log(widths)[::-1]))
-    return float(bandwidth), float(0.5 * (high - low))
+    return float(bandwidth), float(max(high - bandwidth, bandwidth - low))  # one side may end

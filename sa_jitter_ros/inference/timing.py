@@ -525,7 +525,7 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
             return None
         errors = {'acceleration_std': effect.acceleration_std * size_error / size}
         if low < high:  # not the widest band
-            errors['bandwidth'] = 0.5 * (high - low)
+            errors['bandwidth'] = max(high - bandwidth, bandwidth - low)  # one side may end
     if known is not None and not departs(effect, errors, known, data.cycles):
         return None
     return Finding(
