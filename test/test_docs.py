@@ -462,18 +462,19 @@ def table_of_parameters():
     lines = ['# Parameters', '',
              'Every parameter of every node, for whoever writes a machine file or starts a node. '
              'The first table has those that are the same in several nodes.', '',
-             '`<shaft>` stands for each name in `shafts`. A float parameter accepts an integer. '
-             'A *fixed* parameter is read when the node starts. `ros2 param describe` prints the '
-             'same. `python test/test_docs.py` writes this page. Units of channels: '
+             '`<shaft>` stands for each name in `shafts`. A parameter with a star is read only '
+             'when the node starts. A float parameter accepts an integer. `ros2 param describe` '
+             'prints the same. Units of channels: '
              '[interfaces.md](interfaces.md#units-of-the-channels).',
-             '', '## Several nodes', *table('parameter', 'nodes', 'default', 'allowed', 'meaning')]
-    lines += [f'| {key} | {those(nodes)} | {" | ".join(rest)} |'
-              for (key, *rest), nodes in nodes_of.items()
+             '', '## Several nodes', *table('parameter', 'nodes', 'default (allowed)', 'meaning')]
+    lines += [f'| {key} | {those(nodes)} | {with_default(*values)} | {meaning} |'
+              for (key, *values, meaning), nodes in nodes_of.items()
               if len(nodes) > 1 and 'effects.' not in key]
     for name, rows in found.items():
         own = [row for row in rows if nodes_of[row] == [name] and 'effects.' not in row[0]]
-        lines += ['', f'## {name}', *table('parameter', 'default', 'allowed', 'meaning')]
-        lines += [f'| {" | ".join(row)} |' for row in own]
+        lines += ['', f'## {name}', *table('parameter', 'default (allowed)', 'meaning')]
+        lines += [f'| {key} | {with_default(*values)} | {meaning} |'
+                  for key, *values, meaning in own]
     return '\n'.join([*lines, *table_of_effects(found)]) + '\n'
 
 
@@ -496,8 +497,9 @@ def table_of_effects(found):
 
 def parameter_rows(name):
     """Return (name, default, allowed, meaning) of each parameter of a node, in Markdown."""
-    return [(f'`{key}`', '' if key == 'recording' else shown(value), allowed(descriptor),
-             descriptor.description.removesuffix(' [1]') + '; *fixed*' * descriptor.read_only)
+    return [(f'`{key}`' + r'\*' * descriptor.read_only,
+             '' if key == 'recording' else shown(value), allowed(descriptor),
+             descriptor.description.removesuffix(' [1]'))
             for key, (descriptor, value) in parameters_of(name).items()]
 
 
@@ -525,20 +527,26 @@ def shown(value):
     return f'`{str(value).lower() if isinstance(value, bool) else value}`'
 
 
+def with_default(default, limits):
+    """Return a default with what else is allowed."""
+    return f'{default} ({limits})' if limits else default
+
+
 def allowed(descriptor):
-    """Return the range of a parameter in words."""
-    parts = [descriptor.additional_constraints] if descriptor.additional_constraints else []
+    """Return the range of a parameter, or its choices."""
+    text = descriptor.additional_constraints.removeprefix('one of ').removesuffix('.0')
+    parts = [text.replace('more than ', '>').replace('at least ', '≥')] if text else []
     for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
         low, high = limits.from_value, limits.to_value
         has_low = abs(low) < 1e300 and low > -2**63
         has_high = abs(high) < 1e300 and high < 2**63 - 1
         if has_low and has_high:
-            parts.append(f'{low:.8g} to {high:.8g}')
+            parts.append(f'{low:.8g}..{high:.8g}')
         elif has_low:
-            parts.append(f'at least {low:.8g}')
+            parts.append(f'≥{low:.8g}')
         elif has_high:
-            parts.append(f'at most {high:.8g}')
-    return '; '.join(parts)
+            parts.append(f'≤{high:.8g}')
+    return ', '.join(parts)
 
 
 def test_the_list_of_parameters_is_that_of_the_nodes():
