@@ -172,14 +172,13 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
 
     return (
         Finding('Figs. 4-6', 'order tracking simulations and the exact model agree very well',
-                f'KS over the {len(tests)} cases of {tests[0].sizes[0]} against '
-                f'{tests[0].sizes[1]}: smallest p {min(item.p_value for item in tests):.3f}, '
-                f'pooled p {pooled["p_value"]:.3f}; with the same pulse errors amplitudes differ '
-                f'by at most {gap:.1e} (waveform) and {order_gap:.1e} (`order_amplitude`)',
+                f'KS of {len(tests)} cases: smallest p {min(item.p_value for item in tests):.3f}, '
+                f'pooled {pooled["p_value"]:.3f}; same errors: within {gap:.1e} (waveform), '
+                f'{order_gap:.1e} (`order_amplitude`)',
                 agreement(one_distribution(tests), pooled['p_value'] > SIGNIFICANCE,
                           max(gap, order_gap) < _EXACT_ENOUGH)),
         Finding('Fig. 4a', 'for integer r the approximate model coincides with the exact one',
-                f'largest difference under the same errors {coincidence:.1e}',
+                f'same errors: within {coincidence:.1e}',
                 agreement(coincidence < 1e-10)),
         Finding('Fig. 4', 'more revolutions mainly reduce the dispersion',
                 f'N_t 40 to 100: standard deviation {spread[0]:.5f} to {spread[1]:.5f} (r = 1), '
