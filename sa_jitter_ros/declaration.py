@@ -34,7 +34,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
 NODE = 'jitter_predictor'
-SHAFTS = Parameter('shafts', ['shaft'], 'shafts to predict for', read_only=True)
+SHAFTS = Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True)
 #: Parameters of each shaft.
 SHAFT_PARAMETERS = (
     RATIO,
@@ -58,8 +58,8 @@ MODEL_PARAMETERS = (
               minimum=0.0),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration, needed with noise_std',
               unit='Hz', minimum=0.0),
-    Parameter('angle_law', 'linear', 'how the angle runs between pulses, as in the averager',
-              choices=ANGLE_LAWS),
+    Parameter('angle_law', 'linear', 'how the angle runs between pulses, the same in averager '
+              'and predictor', choices=ANGLE_LAWS),
 )
 #: Parameters of the node that are not part of the model.
 FOLLOWING = (

@@ -195,7 +195,7 @@ def sample_parameters(topic: str) -> tuple[Parameter, ...]:
     return (
         Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
                   read_only=True),
-        Parameter('sample_rate', 0.0, f'sampling rate of {topic}; 0 if the messages contain it',
+        Parameter('sample_rate', 0.0, 'sampling rate of the input; 0 if the messages contain it',
                   unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
         Parameter('start_time', 0.0, 'time of the first sample if the messages do not contain it',
                   unit='s', read_only=True),

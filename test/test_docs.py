@@ -487,11 +487,12 @@ def table_of_effects(found):
              '`effects.<name>.enabled` (`false`) adds an effect to the model of '
              '`jitter_predictor`, or to the machine of `machine_simulator`. '
              '[What each of them is](theory.md#effects).',
-             '', *table('parameter', 'predictor', 'simulator', 'allowed', 'meaning')]
+             '', *table('parameter', 'default of predictor, of simulator (allowed)', 'meaning')]
     for key, (_, default, limits, meaning) in predictor.items():
         assert simulator[key][2:] == (limits, meaning)
         if not key.endswith('.enabled`'):
-            lines.append(f'| {key} | {default} | {simulator[key][1]} | {limits} | {meaning} |')
+            both = with_default(f'{default}, {simulator[key][1]}', limits)
+            lines.append(f'| {key} | {both} | {meaning} |')
     return lines
 
 

@@ -34,7 +34,7 @@ PARAMETERS = (
               'of x, y, z', read_only=True),
     Parameter('keyphasor', '', 'source of the pulses to use; empty: that of the first pulse',
               read_only=True),
-    Parameter('shafts', ['shaft'], 'shafts to average', read_only=True),
+    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
     Parameter('buffer_seconds', 5.0, 'how long samples and pulses wait for each other',
               unit='s', above=0.0, maximum=3600.0, read_only=True),
     PULSES_PER_REVOLUTION,
@@ -60,7 +60,8 @@ PARAMETERS = (
               'trigger_cycles; 0: a discarded cycle ends the average', minimum=0.0, maximum=1.0),
     Parameter('averaging', 'block', 'block: an average of every trigger_cycles cycles; sliding, '
               'exponential: one after each cycle', choices=AVERAGING),
-    Parameter('angle_law', 'linear', 'how the angle runs between pulses', choices=ANGLE_LAWS),
+    Parameter('angle_law', 'linear', 'how the angle runs between pulses, the same in averager '
+              'and predictor', choices=ANGLE_LAWS),
     Parameter('correct_jitter', False, 'recover the pulse errors from the vibration, publish '
               'corrected averages'),
     Parameter('keyphasor_rate', 0.0, 'sampling rate of the keyphasor, which limits the pulse '

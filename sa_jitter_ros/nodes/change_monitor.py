@@ -40,7 +40,7 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 STATE_TYPES: dict[str, type] = {
     'std_msgs/Float64': Float64, 'std_msgs/Float64MultiArray': Float64MultiArray}
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'shafts to monitor', read_only=True),
+    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
     *TEST_PARAMETERS,
     Parameter('severe_change', 0.25, 'relative change that is an error, if larger by two standard '
               'errors; others are warnings', above=0.0, maximum=1e6),

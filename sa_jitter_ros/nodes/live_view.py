@@ -37,7 +37,7 @@ LARGEST_REPORT = 1_000_000  # characters of a text in JSON
 NODES, NODE_VALUES = 64, 100  # nodes whose diagnostics are shown, and values of each node
 
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'shafts to show', read_only=True),
+    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
     Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
     Parameter('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
               maximum=65535, read_only=True),

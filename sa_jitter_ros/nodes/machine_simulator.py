@@ -58,8 +58,7 @@ PARAMETERS = (
               choices=('pulses', 'waveform', 'both', 'none'), **FIXED),
     replace(PULSES_PER_REVOLUTION, **FIXED),
     replace(PULSES_PER_TRIGGER, **FIXED),
-    Parameter('keyphasor_rate', 10000.0, 'declared sampling rate of the keyphasor', unit='Hz',
-              above=0.0),
+    Parameter('keyphasor_rate', 10000.0, 'sampling rate of the keyphasor', unit='Hz', above=0.0),
     Parameter('jitter_distribution', 'uniform', 'distribution of the declared pulse error; '
               'sampled: times rounded up to ticks of keyphasor_rate',
               choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
