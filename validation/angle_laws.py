@@ -159,7 +159,6 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
         for law, values in ratios.items() if law != 'linear'}
     advantage = {law: float(np.min(np.mean(linear - values, axis=0)))
                  for law, values in ratios.items() if law != 'linear'}
-    error = numbers['mean_square_angle_error']
     excess = [[spread[sensor][h] / stds[h] for h in range(len(HARMONICS))] for sensor in SENSORS]
     nearer, error_of_nearer = excess_factor(linear, stds)
 
@@ -181,7 +180,7 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
                 'one, close to the mesh',
                 'over predicted, orders 19 and 38: '
                 + '; '.join(f'{sensor} {first:.2f} and {second:.2f}'
-                            for sensor, (first, second) in zip(SENSORS, excess))
+                            for sensor, (first, second) in zip(SENSORS[:_NEAR], excess))
                 + f'; logarithm of first over second {nearer:.3f} +- {error_of_nearer:.3f}',
                 agreement(*(second < first for first, second in excess[:_NEAR]),
                           nearer > _ORDINARY * error_of_nearer),
@@ -194,8 +193,7 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
                 f'{chance(tests["quadratic"])} and {chance(tests["spline"])}',
                 agreement(*(value < SIGNIFICANCE for value in tests.values()),
                           min(advantage.values()) > 0.0),
-                'As the mean square angle errors: '
-                + ', '.join(f'{value:.3f} ({law})' for law, value in error.items()) + '.'),
+                'As the mean square [angle errors](theory.md#angle-laws).'),
     )
 
 
