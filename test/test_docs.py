@@ -73,6 +73,7 @@ NEEDED = {'recording_player': ['-p', 'recording:=rig.npz']}
 PYTHONS = ('python', 'python3', '.venv/bin/python')
 OTHERS = {'.', 'cd', 'colcon', 'export', 'pip'}
 PROGRAMS = {'./run', 'ros2', *PYTHONS, *OTHERS, *NODES, *COMMANDS}
+STAR = r'\*'
 SHARE = '$(ros2 pkg prefix --share sa_jitter_ros)'
 
 
@@ -455,23 +456,24 @@ def parameters_of(name):
 def table_of_parameters():
     """Return docs/parameters.md, where what several nodes have in common stands once."""
     found = {name: parameter_rows(name) for name in NODES}
-    nodes_of = {}  # of each row
+    nodes_of = {}  # of each row without its star; of each node whether it has one
     for name, rows in found.items():
-        for row in rows:
-            nodes_of.setdefault(row, []).append(name)
+        for key, *rest in rows:
+            nodes_of.setdefault((key.removesuffix(STAR), *rest), {})[name] = key.endswith(STAR)
     lines = ['# Parameters', '',
              'Every parameter of every node, for whoever writes a machine file or starts a node. '
              'The first table has those that are the same in several nodes.', '',
-             '`<shaft>` stands for each name in `shafts`. A parameter with a star is read only '
-             'when the node starts. A float parameter accepts an integer. `ros2 param describe` '
-             'prints the same. Units of channels: '
+             '`<shaft>` stands for each name in `shafts`. A parameter with a star, or in a node with '
+             'a star, is read only when the node starts. `ros2 param describe` prints the same. '
+             'Units of channels: '
              '[interfaces.md](interfaces.md#units-of-the-channels).',
              '', '## Several nodes', *table('parameter', 'nodes', 'default (allowed)', 'meaning')]
-    lines += [f'| {key} | {those(nodes)} | {with_default(*values)} | {meaning} |'
-              for (key, *values, meaning), nodes in nodes_of.items()
+    lines += [f'| {key}{STAR * all(nodes.values())} | {those(nodes)} | {with_default(*values)} | '
+              f'{meaning} |' for (key, *values, meaning), nodes in nodes_of.items()
               if len(nodes) > 1 and 'effects.' not in key]
     for name, rows in found.items():
-        own = [row for row in rows if nodes_of[row] == [name] and 'effects.' not in row[0]]
+        own = [row for row in rows if 'effects.' not in row[0]
+               and len(nodes_of[(row[0].removesuffix(STAR), *row[1:])]) == 1]
         lines += ['', f'## {name}', *table('parameter', 'default (allowed)', 'meaning')]
         lines += [f'| {key} | {with_default(*values)} | {meaning} |'
                   for key, *values, meaning in own]
@@ -498,7 +500,7 @@ def table_of_effects(found):
 
 def parameter_rows(name):
     """Return (name, default, allowed, meaning) of each parameter of a node, in Markdown."""
-    return [(f'`{key}`' + r'\*' * descriptor.read_only,
+    return [(f'`{key}`{STAR * descriptor.read_only}',
              '' if key == 'recording' else shown(value), allowed(descriptor),
              descriptor.description.removesuffix(' [1]'))
             for key, (descriptor, value) in parameters_of(name).items()]
@@ -510,13 +512,14 @@ def table(*columns):
 
 
 def those(nodes):
-    """Return the names of some nodes."""
+    """Return the names of some nodes, with a star where only some of them have one."""
     others = [name for name in NODES if name not in nodes]
     if not others:
         return 'all'
     if len(others) < len(nodes):
         return f'all but {", ".join(others)}'
-    return ', '.join(nodes)
+    some = any(nodes.values()) and not all(nodes.values())
+    return ', '.join(name + STAR * (some and star) for name, star in nodes.items())
 
 
 def shown(value):
