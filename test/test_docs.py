@@ -463,9 +463,9 @@ def table_of_parameters():
     lines = ['# Parameters', '',
              'Every parameter of every node, for whoever writes a machine file or starts a node. '
              'The first table has those that are the same in several nodes.', '',
-             '`<shaft>` stands for each name in `shafts`. A parameter with a star, or in a node with '
-             'a star, is read only when the node starts. `ros2 param describe` prints the same. '
-             'Units of channels: '
+             '`<shaft>` stands for each name in `shafts`. A parameter with a star, or in a node '
+             'with a star, is read only when the node starts. `ros2 param describe` prints the '
+             'same. Units of channels: '
              '[interfaces.md](interfaces.md#units-of-the-channels).',
              '', '## Several nodes', *table('parameter', 'nodes', 'default (allowed)', 'meaning')]
     lines += [f'| {key}{STAR * all(nodes.values())} | {those(nodes)} | {with_default(*values)} | '

@@ -44,7 +44,7 @@ PLAYBACK_PARAMETERS = (
     Parameter('wait_seconds', 3.0, 'longest wait for subscribers before the start', unit='s',
               minimum=0.0, maximum=60.0, read_only=True),
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
-              'tach_waveform, or std_msgs/Float32MultiArray',
+              'tach_waveform; the other is std_msgs/Float32MultiArray',
               read_only=True),
     TACH_TYPE,
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the pulses',
