@@ -211,8 +211,8 @@ def detection_table(count: int, seed: int) -> Iterator[str]:
     """Iterate over the lines of the table of growing faults."""
     bands = ((0.01, 0.03), (0.03, 0.1), (0.1, 0.3), (0.3, 1.0))
     faults = [*detections(count, seed)]
-    yield '| fault in | ' + ' | '.join(
-        f'{100.0 * low:.0f} to {100.0 * high:.0f} % a month' for low, high in bands) + ' |'
+    yield '| fault in, % a month | ' + ' | '.join(
+        f'{100.0 * low:.0f} to {100.0 * high:.0f}' for low, high in bands) + ' |'
     yield '|---|' + '---|' * len(bands)
     for kind in KINDS:
         cells = []
@@ -221,18 +221,13 @@ def detection_table(count: int, seed: int) -> Iterator[str]:
                     if name == kind and low <= growth < high]
             days = sorted(item[0] for item in some)
             size = sorted(100.0 * item[0] * item[1] * 86400.0 / MONTH for item in some)
-            middle, late = len(some) // 2, 9 * len(some) // 10
+            middle = len(some) // 2
             cells.append('' if len(some) < 5 else 'not found' if math.isinf(days[middle]) else
-                         f'{days[middle]:.1f} d, {size[middle]:.1f} % ({_days(days[late])})')
+                         f'{days[middle]:.1f}, {size[middle]:.1f}')
         yield f'| {kind} | ' + ' | '.join(cells) + ' |'
     yield ''
     yield (f'{len(faults)} faults, {sum(item[3] for item in faults)} found in the ten months '
            'that were simulated')
-
-
-def _days(value: float) -> str:
-    """Return a number of days, or that there is none."""
-    return f'{value:.1f} d' if math.isfinite(value) else 'later'
 
 
 def six_weeks(kept: float, learning: int, count: int, seed: int) -> tuple[float, float]:
@@ -278,13 +273,13 @@ def _of_days(values: FloatArray, learning: int, memory: FloatArray
 def six_weeks_table(count: int, seed: int) -> Iterator[str]:
     """Iterate over the lines of the table of a value a day."""
     baselines = (8, 10, 15, 20)
-    yield '| correlation of successive days | ' + ' | '.join(
-        f'baseline of {number}' for number in baselines) + ' |'
+    yield '| correlation of successive days, baseline of | ' + ' | '.join(
+        f'{number}' for number in baselines) + ' |'
     yield '|---|' + '---|' * len(baselines)
     for kept in (0.0, 0.3, 0.6):
         cells = [six_weeks(kept, number, count, seed) for number in baselines]
         yield f'| {kept:g} | ' + ' | '.join(
-            f'{100.0 * alarms:.0f} %, {days:.0f} d' for alarms, days in cells) + ' |'
+            f'{100.0 * alarms:.0f}, {days:.0f}' for alarms, days in cells) + ' |'
 
 
 def main() -> None:

@@ -35,7 +35,7 @@ from fault_residual import check_report, ResidualChecker
 from fault_source import FaultySource, KEYPHASOR, Scene
 from matplotlib.figure import Figure
 import numpy as np
-from page import fill, table
+from page import fill
 
 ROOT = Path(__file__).resolve().parents[1]
 PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
@@ -253,30 +253,18 @@ def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float 
 
 def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
     """Return the contents of the campaign's sections."""
-    faults = found['faults']
-    places: dict[str, list[str]] = {}
-    for kind in faults:
-        place, _, what = kind.partition(': ')
-        places.setdefault(place, []).append(what)
-    rows = [(place, ', '.join(kinds), f'{sum(faults[f"{place}: {what}"] for what in kinds):,}')
-            for place, kinds in places.items()]
     averages, extra = found['averages'], found['recovery']
     corrected, verdicts = found['corrected'], found['verdicts']
     again = [scenes for scenes in extra if scenes]
     later = f'; {len(again)} needed up to {max(again)} more' if again else ''
-    summary = (
-        f'{sum(faults.values()):,} faults in {found["scenes"]} scenes and {found["seconds"]:.0f} '
-        f's (seed {found["seed"]}): {sum(averages.values()):,} averages were published and '
-        f'checked ({", ".join(f"{name} {count:,}" for name, count in averages.items())}), '
-        f'**failed checks: {len(found["wrong"])}**, nodes that ended by themselves: '
-        f'{len(found["died"])}. Of the averages with `correct_jitter`, '
-        f'{corrected["corrected"]:,} were corrected and {corrected["refused"]:,} refused; '
-        f'{found["residuals"]:,} residuals were recomputed and {sum(verdicts.values()):,} traces '
-        'checked '
-        f'({", ".join(f"{name} {count:,}" for name, count in verdicts.items())}). In '
-        f'{len(extra) - len(again)} of {len(extra)} scenes all averages were back '
-        f'within the faultless 1.4 s at its end{later}.')
-    return {'campaign': summary, 'faults': table(('where', 'faults', 'injected'), rows)}
+    return {'campaign': (
+        f'{sum(found["faults"].values()):,} faults in {found["scenes"]} scenes (seed '
+        f'{found["seed"]}): {sum(averages.values()):,} averages were checked, **failed checks: '
+        f'{len(found["wrong"])}**, nodes that ended by themselves: {len(found["died"])}. '
+        f'{corrected["corrected"]:,} averages were corrected, {corrected["refused"]:,} '
+        f'corrections refused, {found["residuals"]:,} residuals and {sum(verdicts.values()):,} '
+        f'traces checked. In {len(extra) - len(again)} of {len(extra)} scenes all averages were '
+        f'back within the faultless 1.4 s at its end{later}.')}
 
 
 def draw_faults(found: Mapping[str, Any], folder: Path) -> None:

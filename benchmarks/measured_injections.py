@@ -23,6 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import json
 from pathlib import Path
+import re
 import sys
 import tempfile
 import time
@@ -420,15 +421,15 @@ def run(title: str, parts: Sequence[Bench], name: str, change: float, declared: 
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the outcomes in Markdown: effects down, machines across, sizes in a cell."""
+    """Return the letters of the outcomes in Markdown: effects down, machines across."""
     machines = list(dict.fromkeys(row['machine'] for row in rows))
     lines = ['| put in | ' + ' | '.join(machines) + ' |', '|---|' + '---|' * len(machines)]
     for effect in dict.fromkeys(row['effect'] for row in rows):
-        cells = [[row['outcome'] for row in rows
+        cells = [[re.sub(r'[\d.]', '', row['outcome']) for row in rows
                   if (row['machine'], row['effect']) == (machine, effect)]
                  for machine in machines]
         lines.append(f'| {effect} | ' + ' | '.join(
-            '-' if set(cell) <= {'-'} else ' '.join(cell) for cell in cells) + ' |')
+            '-' if set(cell) <= {'-'} else ''.join(cell) for cell in cells) + ' |')
     return '\n'.join(lines)
 
 

@@ -179,12 +179,10 @@ def section(found: Mapping[str, Any]) -> str:
         f'kHz ({8e-6 * found["channels"] * RATE:.0f} MB/s), {shafts} shaft{"s" * (shafts > 1)}, '
         f'{jitter} `correct_jitter`, {load}average {found["load"][1]}: '
         f'{found["published"]:,} averages were published, at least {shafts * found["expected"]:,} '
-        f'were due; {absent:,} of the first shaft did not reach the watcher{silences}. '
-        f'The latency '
-        f'from the last pulse of an average to its arrival is {np.median(latency):.0f} ms in the '
-        f'median, {np.percentile(latency, 99):.0f} ms at 99 %, {latency.max():.0f} ms at most. '
-        f'The source was late by up to {1e3 * found["source_late"]:.0f} ms itself. Counted: '
-        f'{counted}.')
+        f'were due; {absent:,} of the first shaft did not reach the watcher{silences}. Latency '
+        f'from the last pulse to the arrival: median {np.median(latency):.0f} ms, 99 % '
+        f'{np.percentile(latency, 99):.0f} ms, at most {latency.max():.0f} ms (the source itself '
+        f'was late by up to {1e3 * found["source_late"]:.0f} ms). Counted: {counted}.')
     memory = [(name, *growth(rss)) for name, rss in found['rss'].items()]
     return f'{text}\n\n{table(("process", *MEMORY), memory)}'
 

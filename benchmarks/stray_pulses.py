@@ -108,7 +108,7 @@ def run(seeds: int) -> str:
 def cell(counts: NDArray[np.int64]) -> str:
     """Return revolutions, trigger cycles and wrong ones as text."""
     turns, found, wrong = counts
-    return f'{found / turns:.0%}, {wrong} of {found:,}'
+    return f'{found / turns:.0%}' + (f', {wrong} of {found:,}' if wrong else '')
 
 
 def main() -> None:

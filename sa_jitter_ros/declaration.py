@@ -34,18 +34,15 @@ from sa_jitter_ros.prediction.model import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
 NODE = 'jitter_predictor'
-SHAFTS = Parameter('shafts', ['shaft'], 'names of the shafts to predict for', read_only=True)
+SHAFTS = Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True)
 #: Parameters of each shaft.
 SHAFT_PARAMETERS = (
     RATIO,
-    Parameter('orders', [1.0, 2.0, 3.0], 'orders to predict: multiples of the speed of the '
-              'shaft of interest',
-              above=0.0),
+    Parameter('orders', [1.0, 2.0, 3.0], 'orders to predict, of the shaft of interest', above=0.0),
 )
 #: Parameters of keyphasor and average, the same for all shafts.
 MODEL_PARAMETERS = (
-    Parameter('keyphasor_rate', 10000.0, 'rate at which the keyphasor is sampled', unit='Hz',
-              above=0.0),
+    Parameter('keyphasor_rate', 10000.0, 'sampling rate of the keyphasor', unit='Hz', above=0.0),
     Parameter('trigger_speed', 25.0, 'speed of the tach shaft', unit='Hz', above=0.0),
     PULSES_PER_REVOLUTION,
     PULSES_PER_TRIGGER,
@@ -54,22 +51,22 @@ MODEL_PARAMETERS = (
               choices=DISTRIBUTIONS),
     Parameter('jitter_std', 0.0, 'standard deviation of a normal or triangular pulse error; 0: '
               '1/(sqrt(12) keyphasor_rate)', unit='s', minimum=0.0),
-    Parameter('jitter_table', [], 'equally likely pulse errors, with jitter_distribution table',
+    Parameter('jitter_table', [], 'equally likely pulse errors, for jitter_distribution table',
               unit='s'),
-    Parameter('noise_std', math.nan, 'standard deviation of white noise per vibration sample, in '
-              'units of the vibration; predicted components have the amplitude 1. NaN: not '
-              'declared, so that no noise is predicted and close_loop estimates it', minimum=0.0),
+    Parameter('noise_std', math.nan, 'standard deviation of white noise per sample, where '
+              'components have the amplitude 1; NaN: not declared (close_loop estimates it)',
+              minimum=0.0),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration, needed with noise_std',
               unit='Hz', minimum=0.0),
-    Parameter('angle_law', 'linear', 'how the angle runs between pulses, as in the averager',
-              choices=ANGLE_LAWS),
+    Parameter('angle_law', 'linear', 'how the angle runs between pulses, the same in averager '
+              'and predictor', choices=ANGLE_LAWS),
 )
 #: Parameters of the node that are not part of the model.
 FOLLOWING = (
     Parameter('follow_shaft_speed', False, 'predict at the measured speed (topic '
               'shaft_speed)'),
-    Parameter('speed_tolerance', 1e-3, 'relative change of the speed that starts a new '
-              'prediction', minimum=0.0, maximum=1.0),
+    Parameter('speed_tolerance', 1e-3, 'relative change of the speed that starts a new prediction',
+              minimum=0.0, maximum=1.0),
 )
 
 

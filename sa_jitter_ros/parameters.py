@@ -176,18 +176,18 @@ def listed(values: Iterable[float], digits: int = 4) -> str:
 RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest / speed of the tach shaft',
                   minimum=1e-3, maximum=1e3)
 PULSES_PER_REVOLUTION = Parameter(
-    'pulses_per_revolution', 1, 'pulses per revolution of the tach shaft, including those of '
-    'missing teeth', minimum=1, maximum=100000)
+    'pulses_per_revolution', 1, 'pulses per revolution of the tach shaft, with those of missing '
+    'teeth', minimum=1, maximum=100000)
 PULSES_PER_TRIGGER = Parameter(
-    'pulses_per_trigger', 0, 'pulses per trigger cycle; 0: all pulses of a revolution',
-    minimum=0, maximum=100000)
+    'pulses_per_trigger', 0, 'pulses per trigger cycle; 0: all of a revolution', minimum=0,
+    maximum=100000)
 TRIGGER_CYCLES = Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
                            maximum=1000000)
 #: Of every node, and of every node that takes data.
-HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine, for the diagnostics; empty: name '
+HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in the diagnostics; empty: name '
                         'of this computer')
-STALE_AFTER = Parameter('stale_after', 5.0, 'silence of an input that is a warning, and three '
-                        'times as long an error; 0: never', unit='s', minimum=0.0, maximum=1e6)
+STALE_AFTER = Parameter('stale_after', 5.0, 'silence of an input that is a warning, three times '
+                        'as long an error; 0: never', unit='s', minimum=0.0, maximum=1e6)
 
 
 def sample_parameters(topic: str) -> tuple[Parameter, ...]:
@@ -195,7 +195,7 @@ def sample_parameters(topic: str) -> tuple[Parameter, ...]:
     return (
         Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
                   read_only=True),
-        Parameter('sample_rate', 0.0, f'sampling rate of {topic}; 0 if the messages contain it',
+        Parameter('sample_rate', 0.0, 'sampling rate of the input; 0 if the messages contain it',
                   unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
         Parameter('start_time', 0.0, 'time of the first sample if the messages do not contain it',
                   unit='s', read_only=True),

@@ -73,6 +73,7 @@ NEEDED = {'recording_player': ['-p', 'recording:=rig.npz']}
 PYTHONS = ('python', 'python3', '.venv/bin/python')
 OTHERS = {'.', 'cd', 'colcon', 'export', 'pip'}
 PROGRAMS = {'./run', 'ros2', *PYTHONS, *OTHERS, *NODES, *COMMANDS}
+STAR = r'\*'
 SHARE = '$(ros2 pkg prefix --share sa_jitter_ros)'
 
 
@@ -455,25 +456,27 @@ def parameters_of(name):
 def table_of_parameters():
     """Return docs/parameters.md, where what several nodes have in common stands once."""
     found = {name: parameter_rows(name) for name in NODES}
-    nodes_of = {}  # of each row
+    nodes_of = {}  # of each row without its star; of each node whether it has one
     for name, rows in found.items():
-        for row in rows:
-            nodes_of.setdefault(row, []).append(name)
+        for key, *rest in rows:
+            nodes_of.setdefault((key.removesuffix(STAR), *rest), {})[name] = key.endswith(STAR)
     lines = ['# Parameters', '',
              'Every parameter of every node, for whoever writes a machine file or starts a node. '
              'The first table has those that are the same in several nodes.', '',
-             '`<shaft>` stands for each name in `shafts`. A float parameter accepts an integer. '
-             'A *fixed* parameter is read when the node starts. `ros2 param describe` prints the '
-             'same. `python test/test_docs.py` writes this page. Units of channels: '
+             '`<shaft>` stands for each name in `shafts`. A parameter with a star, or in a node '
+             'with a star, is read only when the node starts. `ros2 param describe` prints the '
+             'same. Units of channels: '
              '[interfaces.md](interfaces.md#units-of-the-channels).',
-             '', '## Several nodes', *table('parameter', 'nodes', 'default', 'allowed', 'meaning')]
-    lines += [f'| {key} | {those(nodes)} | {" | ".join(rest)} |'
-              for (key, *rest), nodes in nodes_of.items()
+             '', '## Several nodes', *table('parameter', 'nodes', 'default (allowed)', 'meaning')]
+    lines += [f'| {key}{STAR * all(nodes.values())} | {those(nodes)} | {with_default(*values)} | '
+              f'{meaning} |' for (key, *values, meaning), nodes in nodes_of.items()
               if len(nodes) > 1 and 'effects.' not in key]
     for name, rows in found.items():
-        own = [row for row in rows if nodes_of[row] == [name] and 'effects.' not in row[0]]
-        lines += ['', f'## {name}', *table('parameter', 'default', 'allowed', 'meaning')]
-        lines += [f'| {" | ".join(row)} |' for row in own]
+        own = [row for row in rows if 'effects.' not in row[0]
+               and len(nodes_of[(row[0].removesuffix(STAR), *row[1:])]) == 1]
+        lines += ['', f'## {name}', *table('parameter', 'default (allowed)', 'meaning')]
+        lines += [f'| {key} | {with_default(*values)} | {meaning} |'
+                  for key, *values, meaning in own]
     return '\n'.join([*lines, *table_of_effects(found)]) + '\n'
 
 
@@ -486,18 +489,20 @@ def table_of_effects(found):
              '`effects.<name>.enabled` (`false`) adds an effect to the model of '
              '`jitter_predictor`, or to the machine of `machine_simulator`. '
              '[What each of them is](theory.md#effects).',
-             '', *table('parameter', 'predictor', 'simulator', 'allowed', 'meaning')]
+             '', *table('parameter', 'default of predictor, of simulator (allowed)', 'meaning')]
     for key, (_, default, limits, meaning) in predictor.items():
         assert simulator[key][2:] == (limits, meaning)
         if not key.endswith('.enabled`'):
-            lines.append(f'| {key} | {default} | {simulator[key][1]} | {limits} | {meaning} |')
+            both = with_default(f'{default}, {simulator[key][1]}', limits)
+            lines.append(f'| {key} | {both} | {meaning} |')
     return lines
 
 
 def parameter_rows(name):
     """Return (name, default, allowed, meaning) of each parameter of a node, in Markdown."""
-    return [(f'`{key}`', '' if key == 'recording' else shown(value), allowed(descriptor),
-             descriptor.description.removesuffix(' [1]') + '; *fixed*' * descriptor.read_only)
+    return [(f'`{key}`{STAR * descriptor.read_only}',
+             '' if key == 'recording' else shown(value), allowed(descriptor),
+             descriptor.description.removesuffix(' [1]'))
             for key, (descriptor, value) in parameters_of(name).items()]
 
 
@@ -507,13 +512,14 @@ def table(*columns):
 
 
 def those(nodes):
-    """Return the names of some nodes."""
+    """Return the names of some nodes, with a star where only some of them have one."""
     others = [name for name in NODES if name not in nodes]
     if not others:
         return 'all'
     if len(others) < len(nodes):
         return f'all but {", ".join(others)}'
-    return ', '.join(nodes)
+    some = any(nodes.values()) and not all(nodes.values())
+    return ', '.join(name + STAR * (some and star) for name, star in nodes.items())
 
 
 def shown(value):
@@ -525,20 +531,26 @@ def shown(value):
     return f'`{str(value).lower() if isinstance(value, bool) else value}`'
 
 
+def with_default(default, limits):
+    """Return a default with what else is allowed."""
+    return f'{default} ({limits})' if limits else default
+
+
 def allowed(descriptor):
-    """Return the range of a parameter in words."""
-    parts = [descriptor.additional_constraints] if descriptor.additional_constraints else []
+    """Return the range of a parameter, or its choices."""
+    text = descriptor.additional_constraints.removeprefix('one of ').removesuffix('.0')
+    parts = [text.replace('more than ', '>').replace('at least ', '≥')] if text else []
     for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
         low, high = limits.from_value, limits.to_value
         has_low = abs(low) < 1e300 and low > -2**63
         has_high = abs(high) < 1e300 and high < 2**63 - 1
         if has_low and has_high:
-            parts.append(f'{low:.8g} to {high:.8g}')
+            parts.append(f'{low:.8g}..{high:.8g}')
         elif has_low:
-            parts.append(f'at least {low:.8g}')
+            parts.append(f'≥{low:.8g}')
         elif has_high:
-            parts.append(f'at most {high:.8g}')
-    return '; '.join(parts)
+            parts.append(f'≤{high:.8g}')
+    return ', '.join(parts)
 
 
 def test_the_list_of_parameters_is_that_of_the_nodes():

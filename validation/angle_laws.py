@@ -159,7 +159,6 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
         for law, values in ratios.items() if law != 'linear'}
     advantage = {law: float(np.min(np.mean(linear - values, axis=0)))
                  for law, values in ratios.items() if law != 'linear'}
-    error = numbers['mean_square_angle_error']
     excess = [[spread[sensor][h] / stds[h] for h in range(len(HARMONICS))] for sensor in SENSORS]
     nearer, error_of_nearer = excess_factor(linear, stds)
 
@@ -168,21 +167,20 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
 
     return (
         Finding('Fig. 16a,b', 'the average attenuation is predicted very well',
-                f'mean ratio of the near sensors {means}; KS ({near[0].sizes[0]} against '
-                f'{near[0].sizes[1]}): smallest p '
+                f'mean ratio of the near sensors {means}; KS: smallest p '
                 f'{min(item.p_value for item in near):.3f}',
                 agreement(gap < 0.005, one_distribution(near))),
         Finding('Fig. 16a,b', 'more dispersion than predicted, from noise, least close to the '
                 'mesh',
-                'standard deviation for orders 19 and 38: predicted ' + listed(stds) + '; '
-                + '; '.join(f'{sensor} {listed(values)}' for sensor, values in spread.items()),
+                'orders 19 and 38: predicted ' + listed(stds)
+                + f'; near 1 {listed(spread["near 1"])}; far 2 {listed(spread["far 2"])}',
                 agreement(*(spread['far 2'][h] > max(spread['near 1'][h], stds[h])
                             for h in range(len(HARMONICS))))),
         Finding('Fig. 16a,b', 'the dispersion of the second harmonic is nearer to the predicted '
                 'one, close to the mesh',
                 'over predicted, orders 19 and 38: '
                 + '; '.join(f'{sensor} {first:.2f} and {second:.2f}'
-                            for sensor, (first, second) in zip(SENSORS, excess))
+                            for sensor, (first, second) in zip(SENSORS[:_NEAR], excess))
                 + f'; logarithm of first over second {nearer:.3f} +- {error_of_nearer:.3f}',
                 agreement(*(second < first for first, second in excess[:_NEAR]),
                           nearer > _ORDINARY * error_of_nearer),
@@ -192,12 +190,10 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
                 'loss of orders 19 and 38 (near sensors): '
                 + '; '.join(f'{law} {listed(values)}' for law, values in losses.items())
                 + '; sign tests '
-                f'{chance(tests["quadratic"])} and {chance(tests["spline"])}; smallest '
-                f'advantage {advantage["quadratic"]:.4f} and {advantage["spline"]:.4f}',
+                f'{chance(tests["quadratic"])} and {chance(tests["spline"])}',
                 agreement(*(value < SIGNIFICANCE for value in tests.values()),
                           min(advantage.values()) > 0.0),
-                'As the mean square angle errors: '
-                + ', '.join(f'{value:.3f} ({law})' for law, value in error.items()) + '.'),
+                'As the mean square [angle errors](theory.md#angle-laws).'),
     )
 
 

@@ -195,8 +195,8 @@ def _findings(fleet: list[Flights], predicted: Array, noisy: list[Array],
         Finding('Table 5, Fig. 21', 'the amplitude ratios of each helicopter are distributed as '
                 'predicted',
                 f'mean ratio {pooled.mean():.4f} (predicted {plain.mean():.4f}); KS of '
-                f'{len(tests)} helicopters (about {tests[0].sizes[0]} against '
-                f'{tests[0].sizes[1]}): smallest p {min(item.p_value for item in tests):.2g}',
+                f'{len(tests)} helicopters: smallest p '
+                f'{min(item.p_value for item in tests):.2g}',
                 agreement(abs(gap) < _CLOSE, one_distribution(tests))),
         Finding('Fig. 21', 'more dispersion than predicted, which the noise explains',
                 f'standard deviation predicted {np.std(plain):.4f}; least to most noise '
@@ -205,7 +205,7 @@ def _findings(fleet: list[Flights], predicted: Array, noisy: list[Array],
                 f'{min(item.p_value for item in explained):.3f}',
                 agreement(spread[-1] > float(np.std(plain)), one_distribution(explained))),
         Finding('Section 5.2.2', 'the added pulse errors are properly described by the model',
-                'measured minus modelled ratio under the same pulse errors: '
+                'same errors: measured minus modelled ratio '
                 f'{same[0].mean():.5f} +- {same[0].std():.4f} with the least noise, '
                 f'{same[1].mean():.5f} +- {same[1].std():.4f} with the most',
                 agreement(abs(z) < _ORDINARY, float(same[0].std()) < 0.2 * spread[0]),

@@ -89,9 +89,8 @@ def _findings(
                  for second in FREQUENCY_RATIOS]
     return (
         Finding('Fig. 7', 'simulations and the exact model agree',
-                f'KS over {len(tests)} cases of {tests[0].sizes[0]} against {tests[0].sizes[1]}: '
-                f'smallest p {min(item.p_value for item in tests):.3f}; with the same pulse '
-                f'errors amplitudes differ by at most {gap:.1e}',
+                f'KS of {len(tests)} cases: smallest p {min(item.p_value for item in tests):.3f}; '
+                f'same errors: within {gap:.1e}',
                 agreement(one_distribution(tests), gap < 1e-3)),
         Finding('Fig. 7a', 'r = 2.286: the approximate model is not suitable',
                 f'KS distance of the models for r_hf = 2, 3, 4: {listed(rough)}',
@@ -104,7 +103,7 @@ def _findings(
                           min(spreads(split)) > alone['radial_std'],
                           spreads(split) == sorted(spreads(split), reverse=True))),
         Finding('Fig. 7b', 'r = 1: the approximate model equals the exact one',
-                f'largest difference {smooth:.1e}', agreement(smooth < 1e-10)),
+                f'same errors: within {smooth:.1e}', agreement(smooth < 1e-10)),
         Finding('Fig. 7b', 'r = 1: the average attenuation differs strongly, orders interact',
                 f'mean {listed(means(whole))} (single {alone["mean"]:.4f}); leakage predicts '
                 f'{listed(predicted)}',

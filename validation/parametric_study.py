@@ -143,17 +143,16 @@ def _findings(numbers: dict[str, Any]) -> tuple[Finding, ...]:
     error = numbers['largest_relative_error_of_the_approximation']
     return (
         Finding('Figs. 9-11', 'the first two cumulants of the squared amplitude (Eqs. 47 to 50)',
-                f'Monte Carlo at {len(checks)} points: exact mean within '
-                f'{max(abs(value) for value in z):.1f} standard errors, variance of a normal X '
-                f'off by {100.0 * min(off):.1f} to {100.0 * max(off):.1f} %; Eqs. 40-45 add up to '
-                f'{100.0 * error["mean"]:.2f} % (mean) and {100.0 * error["variance"]:.1f} % '
-                '(variance)',
+                f'{len(checks)} points: exact mean within {max(abs(value) for value in z):.1f} '
+                f'standard errors, variance of a normal X off by {100.0 * min(off):.1f} to '
+                f'{100.0 * max(off):.1f} %; Eqs. 40-45 add up to {100.0 * error["mean"]:.2f} % '
+                f'(mean) and {100.0 * error["variance"]:.1f} % (variance)',
                 agreement(max(abs(value) for value in z) < 4.0,
                           max(abs(value) for value in off) < 0.1),
                 'With the errata. A normal X does not lie along an arc, which counts at few '
                 'averages without noise.'),
         Finding('Eqs. 48, 50', 'the variance as printed',
-                'printed over simulated variance at the same points: '
+                'printed over simulated at these points: '
                 + ', '.join(f'{value:.2f}' for value in printed),
                 agreement(*(abs(value - 1.0) < 0.1 for value in printed)),
                 'Errata: noise over N^2 in place of N, power of the trace in place of the trace '

@@ -178,8 +178,6 @@ def run(effort: Effort, progress: Progress) -> Results:
                  + ', '.join(f'{item.printed_error:.2g}' for item in errata[:3]) + '; corrected '
                  + ', '.join(f'{item.right_error:.0e}' for item in errata[:3]),
                  agreement(*(item.printed_error < _EXACT for item in errata[:3])),
-                 '[Errata](theory.md#errata-of-the-paper), which no later equation has: for '
-                 'Theta = 1, as from Eq. 26 on, Eq. 17 is right as printed '
-                 f'({parametrised.printed_error:.0e}).')),
+                 '[Errata](theory.md#errata-of-the-paper), which no later equation has.')),
         {}, ('Largest errors are in trigger cycles (Eq. 5), or of a component of amplitude 1. '
              'Eq. 17 with Theta = 0.5, gamma* = 10.',))

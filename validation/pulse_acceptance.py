@@ -86,16 +86,13 @@ def run(effort: Effort, progress: Progress) -> Results:
 
 
 def _finding(found: dict[int, tuple[Losses, Losses]]) -> Finding:
-    first, remedied = found[1]
+    first, _ = found[1]
     default, wide = (sum(item[k].lost for item in found.values()) for k in (0, 1))
     total = sum(item.recordings * item.cycles for item, _ in found.values())
     return Finding(
         'Table 3', 'all N_t trigger cycles of a recording are averaged',
-        f'{first.with_losses} of {first.recordings} recordings of simulation 1 lose cycles, '
-        f'{first.lost} of {first.recordings * first.cycles}; with `interval_tolerance` {WIDE} '
-        f'{remedied.with_losses}, {remedied.lost} cycles. All simulations: {default} of {total} '
-        f'cycles, with {WIDE} {wide}',
+        f'{default} of {total} are lost (simulation 1: {first.lost} of '
+        f'{first.recordings * first.cycles}), with `interval_tolerance` {WIDE} {wide}',
         agreement(default == 0, wide <= _FEW * total),
         'So large a jitter looks like stray or missing pulses. If it is known to be a tenth of an '
-        f'interval or more, set `interval_tolerance` to {WIDE}. Counts and a `DataWarning` say '
-        'what is lost.')
+        f'interval or more, set `interval_tolerance` to {WIDE}.')

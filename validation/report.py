@@ -23,23 +23,22 @@ from validation.results import Effort, Results
 
 _INTRODUCTION = """# Validation against the paper
 
-For whoever wants to know how far this package reproduces V. Camerini, G. Coppotelli, S. Bendisch,
-D. Kiehn, "Impact of pulse time uncertainty on synchronous average: Statistical analysis and
-relevance to rotating machinery diagnosis" (2019). One command compares every numerical result of
-the paper with ours, and writes this page, its figures and `validation.json`:
+How far this package reproduces V. Camerini, G. Coppotelli, S. Bendisch, D. Kiehn, "Impact of pulse
+time uncertainty on synchronous average: Statistical analysis and relevance to rotating machinery
+diagnosis" (2019), for whoever relies on it. One command compares every numerical result of the
+paper with ours:
 
     {command}
 
-`validation.json` holds the numbers of each case, and the settings that differ from the paper or
-that the paper does not give.
+The numbers of each case, and the settings that differ from the paper, are in `validation.json`.
 
 D is the width of the uniform pulse error in cycles of the analysed order, N_t the number of
 trigger cycles in an average, r that of fundamental cycles in a trigger cycle. The exact model
-splits fundamental cycles that straddle a pulse, the approximate one (Eq. 26) does not. KS is a
-two-sample Kolmogorov-Smirnov test, at 1 % for each family of comparisons (Bonferroni). Of the
-kurtosis, *separation* is the difference of the means over the standard deviation, *detection* that
-at 5 % false alarms, *area* that under the ROC curve. The agreement is *yes* if all conditions of
-the command hold, *partly* if some do.
+splits fundamental cycles that straddle a pulse, the approximate one (Eq. 26) does not. *Same
+errors*: the pulse errors are the same. KS is a two-sample Kolmogorov-Smirnov test, at 1 % for each
+family (Bonferroni). Of the kurtosis, *separation* is the difference of the means over the standard
+deviation, *detection* that at 5 % false alarms, *area* that under the ROC curve. The agreement is
+*yes* if all conditions of the command hold, *partly* if some do.
 
 """
 
@@ -73,10 +72,11 @@ def page(results: Mapping[str, Results], command: str) -> str:
              f'{count["partly"]} partly, {count["no"]} not.\n', _items()]
     for group in groups:
         lines.append(f'\n## {group.title}\n')
-        lines.append(_table(
-            (('', 'the paper', 'here', 'agreement', 'why'),
-             *((item.item, item.paper, item.ours, item.agreement, item.why)
-               for item in group.findings))))
+        rows = [('', 'the paper', 'here', 'agreement', 'why'),
+                *((item.item, item.paper, item.ours, item.agreement, item.why)
+                  for item in group.findings)]
+        width = 5 if any(item.why for item in group.findings) else 4
+        lines.append(_table([row[:width] for row in rows]))
         lines += [f'![{stem}](figures/validation-{stem}.png)\n' for stem in group.figures]
     return '\n'.join(lines)
 

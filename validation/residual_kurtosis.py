@@ -220,14 +220,13 @@ def _findings(
         findings.append(Finding(
             case.figure, 'with exact pulse times the kurtosis discriminates well',
             f'medians {exact.healthy_median:.2f} and {exact.faulty_median:.2f}, KS '
-            f'({separate_states.sizes[0]} against {separate_states.sizes[1]}) '
             f'{chance(separate_states.p_value)}; detection {exact.detection:.3f}, area '
             f'{exact.area:.4f}',
             agreement(exact.area > 0.95, separate_states.p_value < 0.01)))
         findings.append(Finding(
             case.figure, f'jitter of {case.mesh_cycles} mesh cycles makes it harder, not '
             'impossible',
-            f'separation {exact.separation:.1f} to {jittered.separation:.1f}, a factor of '
+            f'separation {exact.separation:.1f} to {jittered.separation:.1f}, by '
             f'{factor.value:.2f} ({factor.low:.2f} to {factor.high:.2f} at 95 %); '
             f'detection {jittered.detection:.3f}, area {jittered.area:.4f}',
             agreement(factor.low > 1.0, 0.5 < jittered.area <= exact.area)))

@@ -32,41 +32,40 @@ PARAMETERS = (
               read_only=True),
     Parameter('imu_axis', 'z', 'axes of linear acceleration that are the channels: one or more '
               'of x, y, z', read_only=True),
-    Parameter('keyphasor', '', 'source of the tach pulses to use; empty: source of the first '
-              'pulse', read_only=True),
-    Parameter('shafts', ['shaft'], 'names of the shafts to average', read_only=True),
+    Parameter('keyphasor', '', 'source of the pulses to use; empty: that of the first pulse',
+              read_only=True),
+    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
     Parameter('buffer_seconds', 5.0, 'how long samples and pulses wait for each other',
               unit='s', above=0.0, maximum=3600.0, read_only=True),
     PULSES_PER_REVOLUTION,
     PULSES_PER_TRIGGER,
-    Parameter('missing_teeth', 0, 'number of teeth missing at one place of the target',
+    Parameter('missing_teeth', 0, 'teeth missing at one place of the target', minimum=0,
+              maximum=1000),
+    Parameter('missing_pulses', 'break', 'break: a missing pulse ends the average; bridge: it is '
+              'interpolated', choices=('break', 'bridge')),
+    Parameter('maximum_missing', 3, 'most consecutive missing pulses; more are a standstill',
               minimum=0, maximum=1000),
-    Parameter('missing_pulses', 'break', 'at a missing pulse: end the average (break) or '
-              'interpolate the pulse (bridge)', choices=('break', 'bridge')),
-    Parameter('maximum_missing', 3, 'largest number of consecutive missing pulses; more are taken '
-              'for a standstill', minimum=0, maximum=1000),
-    Parameter('interval_tolerance', 0.0, 'largest accepted change from one pulse interval to the '
-              'next, as a fraction of the interval; 0: learnt from the scatter of the intervals; '
-              'below 0.5, or 1: accept every pulse', minimum=0.0, maximum=1.0),
+    Parameter('interval_tolerance', 0.0, 'largest relative change from one pulse interval to the '
+              'next; 0: learnt; below 0.5, or 1: accept every pulse', minimum=0.0, maximum=1.0),
     Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
               unit='s', minimum=0.0),
-    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, of filters and '
-              'converters; it is subtracted from their times', unit='s'),
-    Parameter('target_geometry', 'none', 'correction of uneven marks: learn (measure how late '
-              'each mark is), given (by target_angles), none', choices=GEOMETRY_MODES),
-    Parameter('target_angles', [], 'how late each mark of the target is, without those of '
-              'missing teeth; with target_geometry given', unit='rad'),
+    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, subtracted from their '
+              'times', unit='s'),
+    Parameter('target_geometry', 'none', 'correction of uneven marks: learn (measured), given '
+              '(target_angles)', choices=GEOMETRY_MODES),
+    Parameter('target_angles', [], 'how late each mark is, missing teeth left out; with '
+              'target_geometry given', unit='rad'),
     TRIGGER_CYCLES,
-    Parameter('maximum_discarded', 0.0, 'largest number of discarded trigger cycles between those '
-              'of an average, as a share of trigger_cycles; 0: a discarded cycle ends the average',
-              minimum=0.0, maximum=1.0),
+    Parameter('maximum_discarded', 0.0, 'most discarded cycles within an average, as a share of '
+              'trigger_cycles; 0: a discarded cycle ends the average', minimum=0.0, maximum=1.0),
     Parameter('averaging', 'block', 'block: an average of every trigger_cycles cycles; sliding, '
-              'exponential: an average after each cycle', choices=AVERAGING),
-    Parameter('angle_law', 'linear', 'how the angle runs between pulses', choices=ANGLE_LAWS),
-    Parameter('correct_jitter', False, 'recover the pulse errors from the vibration and publish '
+              'exponential: one after each cycle', choices=AVERAGING),
+    Parameter('angle_law', 'linear', 'how the angle runs between pulses, the same in averager '
+              'and predictor', choices=ANGLE_LAWS),
+    Parameter('correct_jitter', False, 'recover the pulse errors from the vibration, publish '
               'corrected averages'),
-    Parameter('keyphasor_rate', 0.0, 'rate at which the keyphasor is sampled, which limits the '
-              'pulse errors; 0: the sampling rate of the vibration', unit='Hz', minimum=0.0),
+    Parameter('keyphasor_rate', 0.0, 'sampling rate of the keyphasor, which limits the pulse '
+              'errors; 0: that of the vibration', unit='Hz', minimum=0.0),
     Parameter('interpolation', 'band_limited', 'how samples are interpolated', choices=METHODS),
 )
 
@@ -75,22 +74,20 @@ def shaft_parameters(name: str) -> tuple[Parameter, ...]:
     """Return the parameters of one shaft."""
     return (
         replace(RATIO, name=f'{name}.ratio'),
-        Parameter(f'{name}.ratio_teeth', [], 'numbers of teeth [driver, driven, ...] that '
-                  'give the ratio; instead of ratio', minimum=1, element=int),
-        Parameter(f'{name}.samples_per_revolution', 0, 'points of the waveform; 0: chosen by the '
-                  'node',
+        Parameter(f'{name}.ratio_teeth', [], 'teeth [driver, driven, ...] that give the ratio',
+                  minimum=1, element=int),
+        Parameter(f'{name}.samples_per_revolution', 0, 'points of the waveform; 0: automatic',
                   minimum=0, maximum=1 << 20),
-        Parameter(f'{name}.orders', [1.0, 2.0, 3.0], 'orders to publish: multiples of the speed '
-                  'of this shaft',
+        Parameter(f'{name}.orders', [1.0, 2.0, 3.0], 'orders to publish, of this shaft',
                   above=0.0),
-        Parameter(f'{name}.mesh_orders', [], 'mesh orders: numbers of teeth on this shaft, for '
-                  'the condition indicators', above=0.0),
-        Parameter(f'{name}.sidebands', 1, 'pairs of sidebands that belong to each mesh order',
-                  minimum=0, maximum=100),
-        Parameter(f'{name}.bearing_orders', [], 'orders of the bearings of this shaft (cage, '
-                  'balls, rings), for the squared envelope of the residual signal', above=0.0),
-        Parameter(f'{name}.envelope_band', [], 'lowest and highest frequency of the residual '
-                  'signal whose envelope is taken; empty: all', unit='Hz', minimum=0.0),
+        Parameter(f'{name}.mesh_orders', [], 'numbers of teeth on this shaft, for the condition '
+                  'indicators', above=0.0),
+        Parameter(f'{name}.sidebands', 1, 'pairs of sidebands of each mesh order', minimum=0,
+                  maximum=100),
+        Parameter(f'{name}.bearing_orders', [], 'bearing orders of this shaft (cage, balls, '
+                  'rings), for the squared envelope', above=0.0),
+        Parameter(f'{name}.envelope_band', [], 'band of the residual signal whose envelope is '
+                  'taken; empty: all', unit='Hz', minimum=0.0),
     )
 
 

@@ -44,23 +44,22 @@ _SAME_RUN = 0.1
 _FARTHEST = 4.0
 
 PARAMETERS = (
-    Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of all shafts, '
-              'channels, orders and indicators together', above=0.0, maximum=1e4),
-    Parameter('learning_averages', 200, 'averages in a bin of speed that are learnt before new '
-              f'ones are tested, at least {LEAST_LEARNED} groups', minimum=LEAST_LEARNED,
-              maximum=10000000, read_only=True),
+    Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of everything '
+              'together', above=0.0, maximum=1e4),
+    Parameter('learning_averages', 200, 'averages that a bin learns before it tests, at least '
+              f'{LEAST_LEARNED} groups', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
     Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
               maximum=10000, read_only=True),
-    Parameter('allow_uncorrected', False, 'take raw values where an average has no correction; '
-              'then another keyphasor is a change, too'),
+    Parameter('allow_uncorrected', False, 'take raw values where there is no correction; then '
+              'another keyphasor is a change, too'),
     Parameter('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
               minimum=1e-4, maximum=1.0, read_only=True),
-    Parameter('state_bin', 0.0, 'width of a bin of the operating state, in its unit, each with '
-              'its own baseline; 0: one for all', minimum=0.0, read_only=True),
-    Parameter('state_lowest', math.nan, 'operating state below which averages are discarded; NaN: '
+    Parameter('state_bin', 0.0, 'width of a bin of the operating state; 0: one for all',
+              minimum=0.0, read_only=True),
+    Parameter('state_lowest', math.nan, 'averages at lower operating states are discarded; NaN: '
               'none', read_only=True),
-    Parameter('state_highest', math.nan, 'operating state above which averages are discarded; '
-              'NaN: none', read_only=True),
+    Parameter('state_highest', math.nan, 'averages at higher operating states are discarded; NaN: '
+              'none', read_only=True),
 )
 
 

@@ -40,18 +40,17 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 STATE_TYPES: dict[str, type] = {
     'std_msgs/Float64': Float64, 'std_msgs/Float64MultiArray': Float64MultiArray}
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'names of the shafts that are monitored', read_only=True),
+    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
     *TEST_PARAMETERS,
-    Parameter('severe_change', 0.25, 'relative change that is an error, if it is larger by two '
-              'standard errors; smaller ones are warnings', above=0.0,
-              maximum=1e6),
-    Parameter('baseline_file', '', 'file that keeps the baseline (.npz); empty: '
-              'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: it is '
-              'lost when the node ends', read_only=True),
-    Parameter('relearn', False, 'set to true at run time: learn a new baseline; the file of the '
-              'old one is kept beside the new one, with a number in its name'),
+    Parameter('severe_change', 0.25, 'relative change that is an error, if larger by two standard '
+              'errors; others are warnings', above=0.0, maximum=1e6),
+    Parameter('baseline_file', '', 'file of the baseline (.npz); empty: '
+              'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: not '
+              'kept', read_only=True),
+    Parameter('relearn', False, 'true: learn a new baseline; the old file is kept, with a number '
+              'in its name'),
     Parameter('operating_state_type', 'std_msgs/Float64', 'message type of operating_state; '
-              'std_msgs/Float64MultiArray is [time in s on the clock of the averages, value]',
+              'std_msgs/Float64MultiArray is [time on the clock of the averages, value]',
               read_only=True),
 )
 _NOT_KEPT = 'none'

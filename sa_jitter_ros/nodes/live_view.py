@@ -37,16 +37,15 @@ LARGEST_REPORT = 1_000_000  # characters of a text in JSON
 NODES, NODE_VALUES = 64, 100  # nodes whose diagnostics are shown, and values of each node
 
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'names of the shafts to show, as in the averager',
-              read_only=True),
+    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
     Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
-    Parameter('port', 8420, 'port of the page; the next free one if it is in use; 0: any free '
-              'port', minimum=0, maximum=65535, read_only=True),
-    Parameter('open_to_network', False, 'allow a host that other machines can reach; everybody '
-              'who can reach it sees everything', read_only=True),
-    Parameter('vibration_unit', '', 'unit of the vibration, for labels; empty: that of '
+    Parameter('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
+              maximum=65535, read_only=True),
+    Parameter('open_to_network', False, 'allow a host that others can reach; everybody then sees '
+              'everything', read_only=True),
+    Parameter('vibration_unit', '', 'unit of the vibration on labels; empty: that of '
               'machine.channels'),
-    Parameter('channel_names', [], 'names of the vibration channels, for labels; empty: those of '
+    Parameter('channel_names', [], 'names of the channels on labels; empty: those of '
               'machine.channels', element=str),
 )
 

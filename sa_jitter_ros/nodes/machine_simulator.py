@@ -43,41 +43,37 @@ PARAMETERS = (
     Parameter('channel_gains', [1.0], 'gain of each vibration channel', **FIXED),
     Parameter('shafts', ['shaft'], 'names of the shafts', **FIXED),
     Parameter('speed', 25.0, 'speed of the tach shaft', unit='Hz', above=0.0, **FIXED),
-    Parameter('speed_profile', [], 'speed that changes: time (s), speed (Hz), time, speed, ...; '
-              'linear between these times; instead of speed', minimum=0.0, **FIXED),
+    Parameter('speed_profile', [], 'instead of speed: time (s), speed (Hz), time, speed, ...; '
+              'linear between', minimum=0.0, **FIXED),
     Parameter('speed_fluctuation_std', 0.0, 'standard deviation of a random speed fluctuation, '
-              'relative to the speed',
-              minimum=0.0, maximum=0.1, **FIXED),
-    Parameter('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of the speed '
-              'fluctuation',
-              unit='Hz', above=0.0, **FIXED),
-    Parameter('torsion_order', 2.0, 'torsional oscillations per revolution of the tach shaft',
-              minimum=0.0, **FIXED),
+              'relative', minimum=0.0, maximum=0.1, **FIXED),
+    Parameter('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of the '
+              'fluctuation', unit='Hz', above=0.0, **FIXED),
+    Parameter('torsion_order', 2.0, 'torsional oscillations per tach revolution', minimum=0.0,
+              **FIXED),
     Parameter('torsion_amplitude', 0.0, 'amplitude of the torsional oscillation', unit='rad',
               minimum=0.0, **FIXED),
-    Parameter('noise_std', 0.1, 'declared white noise per vibration sample, in units of the '
-              'vibration', minimum=0.0),
+    Parameter('noise_std', 0.1, 'declared white noise per vibration sample', minimum=0.0),
     Parameter('tach', 'pulses', 'output of the keyphasor',
               choices=('pulses', 'waveform', 'both', 'none'), **FIXED),
     replace(PULSES_PER_REVOLUTION, **FIXED),
     replace(PULSES_PER_TRIGGER, **FIXED),
-    Parameter('keyphasor_rate', 10000.0, 'declared rate at which the keyphasor is sampled',
-              unit='Hz', above=0.0),
+    Parameter('keyphasor_rate', 10000.0, 'sampling rate of the keyphasor', unit='Hz', above=0.0),
     Parameter('jitter_distribution', 'uniform', 'distribution of the declared pulse error; '
-              'sampled: pulse times are rounded up to a clock of keyphasor_rate; none: no errors',
+              'sampled: times rounded up to ticks of keyphasor_rate',
               choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
     Parameter('jitter_std', 0.0, 'standard deviation of the declared pulse error; 0: '
               '1/(sqrt(12) keyphasor_rate)',
               unit='s', minimum=0.0),
-    Parameter('jitter_table', [], 'equally likely pulse errors, with jitter_distribution table',
+    Parameter('jitter_table', [], 'equally likely pulse errors, for jitter_distribution table',
               unit='s'),
     Parameter('waveform', 'ttl', 'shape of the tach waveform', choices=('ttl', 'sine'), **FIXED),
     Parameter('waveform_rate', 50000.0, 'sampling rate of the tach waveform', unit='Hz',
               above=0.0, **FIXED),
     Parameter('waveform_rise_time', 0.0, 'rise time of a ttl edge', unit='s', minimum=0.0,
               **FIXED),
-    Parameter('waveform_noise_std', 0.0, 'standard deviation of white noise on the tach '
-              'waveform, which is 0 to 5 V', unit='V', minimum=0.0, **FIXED),
+    Parameter('waveform_noise_std', 0.0, 'standard deviation of noise on the tach waveform of 0 '
+              'to 5 V', unit='V', minimum=0.0, **FIXED),
 )
 # Sizes at which an effect is significant as soon as it is enabled.
 EFFECT_DEFAULTS = {
@@ -96,14 +92,13 @@ def simulated_shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     return (
         Parameter(f'{shaft}.ratio', 1.0, 'speed of this shaft / speed of the tach shaft',
                   above=0.0, **FIXED),
-        Parameter(f'{shaft}.teeth', 23, 'number of teeth of its gear: the mesh order', minimum=1,
-                  **FIXED),
+        Parameter(f'{shaft}.teeth', 23, 'teeth of its gear: the mesh order', minimum=1, **FIXED),
         Parameter(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and '
                   'its multiples', minimum=0.0, **FIXED),
         Parameter(f'{shaft}.sidebands', 0.2, 'amplitude of the sidebands one order beside each '
-                  'multiple, relative to it', minimum=0.0, **FIXED),
-        Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst that a chipped tooth '
-                  'causes once per revolution'),
+                  'multiple, relative', minimum=0.0, **FIXED),
+        Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst of a chipped tooth, once '
+                  'a revolution'),
     )
 
 

@@ -34,28 +34,24 @@ FloatArray = NDArray[np.float64]
 PARAMETERS = (
     Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
     Parameter('loop', False, 'start again at the end; times and indices continue'),
-    Parameter('tach', 'auto', 'keyphasor to play; reference: pulses of the reference keyphasor; '
-              'both: pulses and waveform; auto: the first of pulses, waveform and reference in '
-              'the file',
-              choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'),
+    Parameter('tach', 'auto', 'keyphasor to play; reference: the reference keyphasor; both: '
+              'pulses and waveform; auto: the first of pulses, waveform, reference',
+              choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'), read_only=True),
+    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: as '
+              'recorded', unit='Hz', minimum=0.0, read_only=True),
+    Parameter('recorded_keyphasor', '', 'keyphasor to play, of several in a bag; empty: the first',
               read_only=True),
-    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: times as '
-              'recorded', unit='Hz', minimum=0.0,
+    Parameter('acquisition', 0, 'acquisition to play, of several in a file', minimum=0,
               read_only=True),
-    Parameter('recorded_keyphasor', '', 'keyphasor to play, of a bag that contains several; '
-              'empty: the first', read_only=True),
-    Parameter('acquisition', 0, 'number of the acquisition to play, of a file that contains '
-              'several', minimum=0, read_only=True),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration if the file does not contain it',
               unit='Hz', minimum=0.0, read_only=True),
     Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of '
-              'a bag; empty: all channels except the tach waveform', element=str, read_only=True),
-    Parameter('tach_channel', '', 'name or number of the channel with the tach waveform',
+              'a bag; empty: all but the tach', element=str, read_only=True),
+    Parameter('tach_channel', '', 'name or number of the tach waveform', read_only=True),
+    Parameter('time_column', '', 'name or number of the column of times in a .csv',
               read_only=True),
-    Parameter('time_column', '', 'name or number of the column of a .csv with the times',
-              read_only=True),
-    Parameter('fields', [], 'fields of the recording, each as NAME=KEY, the key that the file has '
-              'for it, or NAME=VALUE', element=str, read_only=True),
+    Parameter('fields', [], 'NAME=KEY: the key that the file has for a field; or NAME=VALUE',
+              element=str, read_only=True),
 )
 
 

@@ -44,10 +44,10 @@ from std_msgs.msg import Float64MultiArray, String
 
 PARAMETERS = (
     Parameter('shaft', 'shaft', 'shaft whose averages are compared', read_only=True),
-    Parameter('predictor', 'jitter_predictor', 'node whose predictions are compared, and whose '
+    Parameter('predictor', 'jitter_predictor', 'node whose predictions are compared and whose '
               'effects are set', read_only=True),
-    Parameter('acquisitions', 20, 'averages that are compared at once; at least 4 to find a '
-              'missing effect', minimum=2, maximum=10000),
+    Parameter('acquisitions', 20, 'averages compared at once; at least 4 to find a missing effect',
+              minimum=2, maximum=10000),
     Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),
 )
 _SIGNIFICANT = 0.02  # p value of a residual that is no chance

@@ -29,9 +29,8 @@ from sensor_msgs.msg import TimeReference
 NO_HEADER = ('messages have no header: sample times are counted from start_time, and lost samples '
              'are not detected; send time, sampling rate and index of the first sample')
 TACH_TYPE = Parameter(
-    'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse: '
-    'sensor_msgs/TimeReference, or std_msgs/Float64MultiArray for more than a few hundred pulses '
-    'per second', read_only=True)
+    'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; '
+    'std_msgs/Float64MultiArray for more than some hundred pulses a second', read_only=True)
 
 
 class SampleInput:

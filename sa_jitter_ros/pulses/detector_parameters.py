@@ -14,24 +14,24 @@ from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.pulses.detection import KeyphasorDetector
 
 DETECTOR_PARAMETERS = (
-    Parameter('automatic_threshold', True, 'learn the threshold from the state levels (low and '
-              'high) of the waveform'),
+    Parameter('automatic_threshold', True, 'learn the threshold from the low and high level of '
+              'the waveform'),
     Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
-    Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of the '
-              'difference between the state levels', minimum=0.0, maximum=0.99),
+    Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of high '
+              'minus low level', minimum=0.0, maximum=0.99),
     Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below; '
-              'auto: decided from the first levels of a run, the rarer state being the pulse',
+              'auto: the rarer level of the start is the pulse',
               choices=('positive', 'negative', 'auto')),
     Parameter('edge', 'rising', 'edge of the pulse that gives its time',
               choices=('rising', 'falling', 'centre')),
-    Parameter('interpolate', True, 'interpolate the time between samples; false: time of the '
-              'first sample past the threshold'),
+    Parameter('interpolate', True, 'interpolate the time between samples; false: first sample '
+              'past the threshold'),
     Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
               unit='s', minimum=0.0),
-    Parameter('learning_time', 0.5, 'length of the windows from which the state levels are learnt',
+    Parameter('learning_time', 0.5, 'length of the windows from which the levels are learnt',
               unit='s', above=0.0, maximum=60.0),
-    Parameter('minimum_difference', 0.0, 'state levels closer than this are taken for noise [unit '
-              'of the waveform]', minimum=0.0),
+    Parameter('minimum_difference', 0.0, 'levels closer than this are noise [unit of the '
+              'waveform]', minimum=0.0),
 )
 
 # Parameters that are options of the detector, and all that decide which pulses it finds.
