@@ -37,7 +37,8 @@ from sa_jitter_ros.pulses.detection import spikes_text
 from sa_jitter_ros.pulses.detector_parameters import detector_of
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
-from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
+from sa_jitter_ros.recordings.channel_check import (
+    channel_faults, fault_texts, is_lost, without_channels)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
 from sa_jitter_ros.tacholess.recording import Tacholess
@@ -256,11 +257,7 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     several = '' if recording.acquisitions == 1 else (
         f'the file holds {recording.acquisitions} acquisitions, of which one is averaged: '
         '--acquisition chooses another')
-    remarks = [*filter(None, [several]), *recording.remarks, *(
-        f'{recording.channel_names[channel]} {reason}'
-        + (' and is left out: check its sensor and cable' if channel in lost else
-           ': lower its gain, or choose a larger range')
-        for channel, reason in faults.items())]
+    remarks = [*filter(None, [several]), *recording.remarks, *fault_texts(recording, faults)]
     recording = without_channels(recording, lost)
     found = None
     if job.tacholess is not None:

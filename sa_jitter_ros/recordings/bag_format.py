@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import missing_library
+from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import check_bag
 from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, FLOAT32, FLOAT64, IMU, SampleDecoder,
@@ -103,36 +103,35 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
     waveform = channel_map.tach if channel_map.tach.startswith('/') else ''
     channels = ChannelMap(tuple(e for e in channel_map.vibration if not e.startswith('/')),
                           '' if waveform else channel_map.tach)
-    with recording_errors(path):
-        with _reader(path) as reader:
-            vibration = _find_topic(
-                reader, topics[0] if topics else '', 'vibration', _SAMPLE_TYPES)
-            tach = _find_topic(reader, waveform, 'tach_waveform', _SAMPLE_TYPES)
-            pulses = _find_topic(reader, '', 'tach_pulse', _PULSE_TYPES)
-            if not vibration:
-                raise RecordingError('no vibration topic among '
-                                     f'{", ".join(sorted(reader.topics)) or "none"}')
-            extent = _measure(reader, vibration, sample_rate)
-            if sample_rate is not None and not math.isclose(extent.rate, sample_rate,
-                                                            rel_tol=_SAME_RATE):
-                raise RecordingError(f'sample_rate {sample_rate} Hz given, but the messages of '
-                                     f'{vibration} say {extent.rate} Hz: leave it out')
-            tach_extent = _measure(reader, tach, sample_rate) if tach else None
-            pulse_times, remarks = _pulses(reader, pulses, keyphasor) if pulses else (None, ())
-        source = BagSource(path, vibration, sample_rate, extent.channels, extent.samples)
-        if tach_extent and abs(tach_extent.start_time - extent.start_time) > TIME_TOLERANCE:
-            raise RecordingError(
-                f'{tach} starts at {tach_extent.start_time} s and {vibration} at '
-                f'{extent.start_time} s: record both from the same moment')
-        return channels.select(Recording(
-            source, extent.rate, start_time=extent.start_time,
-            channel_names=tuple(_IMU_AXES) if extent.imu else (),
-            units=('m/s^2',) if extent.imu else (),
-            tach=None if tach_extent is None else BagSource(
-                path, tach, sample_rate, tach_extent.channels, tach_extent.samples),
-            tach_rate=None if tach_extent is None else tach_extent.rate,
-            pulse_times=pulse_times,
-            remarks=(*extent.remarks, *(tach_extent.remarks if tach_extent else ()), *remarks)))
+    with _reader(path) as reader:
+        vibration = _find_topic(
+            reader, topics[0] if topics else '', 'vibration', _SAMPLE_TYPES)
+        tach = _find_topic(reader, waveform, 'tach_waveform', _SAMPLE_TYPES)
+        pulses = _find_topic(reader, '', 'tach_pulse', _PULSE_TYPES)
+        if not vibration:
+            raise RecordingError('no vibration topic among '
+                                 f'{", ".join(sorted(reader.topics)) or "none"}')
+        extent = _measure(reader, vibration, sample_rate)
+        if sample_rate is not None and not math.isclose(extent.rate, sample_rate,
+                                                        rel_tol=_SAME_RATE):
+            raise RecordingError(f'sample_rate {sample_rate} Hz given, but the messages of '
+                                 f'{vibration} say {extent.rate} Hz: leave it out')
+        tach_extent = _measure(reader, tach, sample_rate) if tach else None
+        pulse_times, remarks = _pulses(reader, pulses, keyphasor) if pulses else (None, ())
+    source = BagSource(path, vibration, sample_rate, extent.channels, extent.samples)
+    if tach_extent and abs(tach_extent.start_time - extent.start_time) > TIME_TOLERANCE:
+        raise RecordingError(
+            f'{tach} starts at {tach_extent.start_time} s and {vibration} at '
+            f'{extent.start_time} s: record both from the same moment')
+    return channels.select(Recording(
+        source, extent.rate, start_time=extent.start_time,
+        channel_names=tuple(_IMU_AXES) if extent.imu else (),
+        units=('m/s^2',) if extent.imu else (),
+        tach=None if tach_extent is None else BagSource(
+            path, tach, sample_rate, tach_extent.channels, tach_extent.samples),
+        tach_rate=None if tach_extent is None else tach_extent.rate,
+        pulse_times=pulse_times,
+        remarks=(*extent.remarks, *(tach_extent.remarks if tach_extent else ()), *remarks)))
 
 
 class _BlockRun:
@@ -187,12 +186,9 @@ class _BlockRun:
 @contextmanager
 def _reader(path: Path) -> Iterator[Any]:
     """Open a bag; `rosbags` must not compile the message definitions in it."""
-    try:
-        from rosbags.rosbag2 import Reader
-    except ImportError as error:
-        raise missing_library('bags are', 'rosbags', 'bags') from error
+    rosbag2 = library('rosbags.rosbag2', 'bags are', 'rosbags', 'bags')
     check_bag(path)
-    with Reader(path) as reader:
+    with rosbag2.Reader(path) as reader:
         if reader.compression_mode == 'message':
             raise RecordingError('messages are compressed one by one: convert the bag with ros2 '
                                  'bag convert to compressed files, or to no compression')

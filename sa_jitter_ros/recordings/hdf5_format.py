@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import MAX_FIELD_BYTES, RawArray, recording_from_fields
-from sa_jitter_ros.recordings.libraries import missing_library
+from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -44,11 +44,8 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
     `struct/k/variable`. Raises RecordingError if h5py is not
     installed, the file is broken, or a variable has the wrong class.
     """
-    try:
-        import h5py
-    except ImportError:
-        raise missing_library('MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
-                              ", or save the file with '-v7'") from None
+    h5py = library('h5py', 'MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
+                   ", or save the file with '-v7'")
     with h5py.File(path, 'r') as file:
         variables = dict(islice(_datasets(file, file, '', ()), _MOST_KEYS))
         return recording_from_fields(

@@ -10,15 +10,25 @@
 
 """Libraries that read one format of recordings and are optional dependencies."""
 
+from importlib import import_module
+from typing import Any
+
 from sa_jitter_ros.errors import RecordingError
 
 
-def missing_library(reads: str, name: str, extra: str, otherwise: str = '') -> RecordingError:
+def library(module: str, reads: str, name: str, extra: str, otherwise: str = '') -> Any:
     """
-    Return the error for a library that is not installed, but by an `extra` of this package.
+    Return the module of a library; raises RecordingError that says how to install it.
 
-    >>> print(missing_library('bags are', 'rosbags', 'bags'))  # doctest: +ELLIPSIS
-    bags are read with rosbags, which is not installed: ... 'sa_jitter_ros[bags]' or rosbags
+    `reads` is what it reads, `extra` the one of this package that installs it.
+
+    >>> library('no_such', 'bags are', 'rosbags', 'bags')  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    ...
+    sa_jitter_ros.errors.RecordingError: bags are read with rosbags, which is not installed: ...
     """
-    return RecordingError(f'{reads} read with {name}, which is not installed: pip install '
-                          f"'sa_jitter_ros[{extra}]' or {name}{otherwise}")
+    try:
+        return import_module(module)
+    except ImportError:
+        raise RecordingError(f'{reads} read with {name}, which is not installed: pip install '
+                             f"'sa_jitter_ros[{extra}]' or {name}{otherwise}") from None

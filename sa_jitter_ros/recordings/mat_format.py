@@ -42,7 +42,7 @@ from sa_jitter_ros.recordings.fields import (
     MAX_FIELD_BYTES, RawArray, recording_from_fields)
 from sa_jitter_ros.recordings.hdf5_format import open_hdf5
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording
 
 _Buffer = bytes | mmap.mmap
 
@@ -86,18 +86,17 @@ def open_mat(path: Path, *, acquisition: int, given: Mapping[str, Any],
     Raises RecordingError if the file is broken, of version 4, of version 7.3 without h5py, or a
     variable of a recording has the wrong class.
     """
-    with recording_errors(path):
-        with open(path, 'rb') as file:
-            head = file.read(_HEADER)
-            if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
-                return open_hdf5(path, acquisition=acquisition, given=given,
+    with open(path, 'rb') as file:
+        head = file.read(_HEADER)
+        if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
+            return open_hdf5(path, acquisition=acquisition, given=given,
+                             pulses_suffice=pulses_suffice)
+        order = _byte_order(head)
+        whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    variables = dict(_Reader(order).variables(whole))
+    return recording_from_fields(variables, lambda name, limit: variables[name](limit),
+                                 acquisition=acquisition, given=given,
                                  pulses_suffice=pulses_suffice)
-            order = _byte_order(head)
-            whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        variables = dict(_Reader(order).variables(whole))
-        return recording_from_fields(variables, lambda name, limit: variables[name](limit),
-                                     acquisition=acquisition, given=given,
-                                     pulses_suffice=pulses_suffice)
 
 
 def _byte_order(head: bytes) -> str:

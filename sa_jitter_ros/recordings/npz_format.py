@@ -32,7 +32,7 @@ from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording
 
 _COPY_BYTES = 1 << 20
 _HEADER_BYTES = 10_000
@@ -46,7 +46,7 @@ def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any],
     Raises RecordingError if the archive is broken, contains pickled objects or a field exceeds its
     limit.
     """
-    with recording_errors(path), _archive(path) as archive:
+    with _archive(path) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
         return recording_from_fields(
             names, lambda name, limit: _member(archive, path, name, limit),

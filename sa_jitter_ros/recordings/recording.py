@@ -10,7 +10,7 @@
 
 """A recording: a description of the machine, and samples that are read block by block."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 import math
@@ -66,6 +66,24 @@ class ArraySource:
         """Iterate over `channel` x `sample` blocks as float64."""
         for start in range(0, self.samples, samples_per_block):
             yield np.array(self.array[:, start:start + samples_per_block], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedSource:
+    """Another source, each of whose blocks is changed: into one of so many `channels`."""
+
+    source: SampleSource
+    channels: int
+    change: Callable[[FloatArray], FloatArray]
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+        return self.source.samples
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        return map(self.change, self.source.blocks(samples_per_block))
 
 
 @dataclass(frozen=True, eq=False)
