@@ -20,14 +20,13 @@ the machine has changed since the first N recordings, in changes.json, changes.p
 import argparse
 from collections.abc import Sequence
 from functools import partial
-import os
 from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, Parser,
-    read_options, show, tacholess_options)
-from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
+    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
+    Parser, read_options, run_to_end, show, tacholess_options)
+from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.change_test import LEAST_LEARNED
@@ -41,11 +40,9 @@ from sa_jitter_ros.recordings.fields import fields_of
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='average', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('average', __doc__)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2, or a '
-                        'folder of them')
+                        help=f'{FORMATS}, or a folder of them')
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of the machine; without: settings are chosen from '
                         'each recording')
@@ -83,11 +80,12 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
 
     Its parameters are taken out of the given ones.
     """
-    if options.baseline is None:
-        if options.state:
-            raise ParameterError('--state needs --baseline')
-        return None
     of_monitor = [text for text in options.given if text.partition(':=')[0] in SETTINGS]
+    if options.baseline is None:
+        needing = [*['--state'] * bool(options.state), *(f'-p {text}' for text in of_monitor)]
+        if needing:
+            raise ParameterError(f'{needing[0]} needs --baseline')
+        return None
     options.given = [text for text in options.given if text not in of_monitor]
     settings = settings_of(options.params, of_monitor, options.baseline)
     if settings.uses_state != bool(options.state):
@@ -97,20 +95,16 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     return settings
 
 
-def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
+def planned(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
     """Return the jobs, and rows of recordings that cannot have one; raises ParameterError."""
     machine = MachineFile.read(options.params, options.given)
     if machine.unknown:
         print(f'average: {options.params}: ignored, because synchronous_averager has no such '
               f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
-    tacholess = tacholess_options(options)
-    found = recordings_of(options)
-    output = options.output.absolute()
-    keywords, fields = read_options(options), tuple(fields_of(options.fields))
-    return [AverageJob(
-        item.name, os.path.abspath(item.path), str(output / item.name), machine, keywords, fields,
-        not options.no_figures, options.state, tacholess) for item in found if not item.error], [
-            Row(item.name, str(item.path), item.error) for item in found if item.error]
+    return jobs_of(options, partial(
+        AverageJob, machine=machine, options=read_options(options),
+        fields=tuple(fields_of(options.fields)), figures=not options.no_figures,
+        state=options.state, tacholess=tacholess_options(options)), Row)
 
 
 def run(options: argparse.Namespace, progress: Progress, *, changes: list[Changes]) -> list[Row]:
@@ -120,7 +114,7 @@ def run(options: argparse.Namespace, progress: Progress, *, changes: list[Change
     With a baseline, what has changed is added to `changes`.
     """
     settings = settings_for_changes(options)
-    jobs, rows = jobs_of(options)
+    jobs, rows = planned(options)
 
     def alone(job: AverageJob) -> Row:
         done = len(rows)
@@ -171,7 +165,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(args)
     changes: list[Changes] = []
     return run_to_end(partial(run, changes=changes), partial(tell, changes=changes), options,
-                      Progress('average', quiet=options.quiet))
+                      Progress('average', quiet=options.quiet), stopped=STOPPED)
 
 
 if __name__ == '__main__':

@@ -29,7 +29,8 @@ from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, read_about, Signals, stamp, write_averages)
+    finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, stamp,
+    write_averages)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -54,18 +55,15 @@ _MOST_REMARKS = 10
 
 
 @dataclass(frozen=True)
-class AverageJob:
+class AverageJob(RecordingJob):
     """
-    One recording to average: its `name` in the results, its `path` and the folder of its files.
+    One recording to average.
 
     `options` are keywords of `read`; `fields` among them are those that the user gave. The channel
     `state`, a name or a number, may be constant. With `tacholess` the pulses are found in the
     vibration.
     """
 
-    name: str
-    path: str
-    folder: str
     machine: MachineFile
     options: Mapping[str, Any] = field(default_factory=dict)
     fields: tuple[str, ...] = ()
@@ -75,7 +73,7 @@ class AverageJob:
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(RecordingRow):
     """
     What became of one recording.
 
@@ -84,9 +82,6 @@ class Row:
     `trigger_speed` (Hz) is the mean of the averages.
     """
 
-    recording: str
-    path: str
-    error: str = ''
     averages: int = 0
     trigger_speed: float = math.nan
     trigger_cycles: int = 0
@@ -227,15 +222,10 @@ def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
         settings = _settings(job)
         done = read_about(Path(job.folder))
         if done is not None and done.get('settings') == settings:
-            return _row(done['row'])
+            return Row(**row_values(done['row']))
         return _averaged(job, settings, progress)
     except SaJitterError as error:
         return Row(job.name, job.path, error=str(error))
-
-
-def _row(values: Mapping[str, Any]) -> Row:
-    """Return the row of a folder that was finished before."""
-    return Row(**{**values, 'remarks': tuple(values['remarks'])})
 
 
 def _settings(job: AverageJob) -> dict[str, Any]:
