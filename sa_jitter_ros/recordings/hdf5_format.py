@@ -27,7 +27,7 @@ import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import MAX_FIELD_BYTES, RawArray, recording_from_fields
 from sa_jitter_ros.recordings.libraries import library
-from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording
 
 _ROWS_BYTES = 1 << 24
@@ -88,9 +88,7 @@ def _array(file: Any, name: str, dataset: Any, limit: int) -> RawArray:
     if dataset.dtype.kind not in 'fiub':
         raise RecordingError(f'{name} has type {dataset.dtype}: give real numbers or text')
     shape, size = dataset.shape, prod(dataset.shape) * dataset.dtype.itemsize
-    if size > limit:
-        raise RecordingError(f'{name}: {size} bytes exceed its limit of {limit}: split the '
-                             'recording')
+    check_size(name, size, limit)
     if size <= IN_MEMORY_BYTES:
         return np.asarray(dataset[()]).T
     check_inflation(name, dataset.id.get_storage_size(), size, 'store it without compression')

@@ -41,7 +41,7 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import (
     MAX_FIELD_BYTES, RawArray, recording_from_fields)
 from sa_jitter_ros.recordings.hdf5_format import open_hdf5
-from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording
 
 _Buffer = bytes | mmap.mmap
@@ -210,10 +210,8 @@ class _Reader:
                                  f'{limit} bytes: split the recording')
         if matrix.kind == _CELL:
             cells = list(self._cells(data, matrix))
-            size = 4 * len(cells) * max(map(len, cells), default=0)
-            if size > limit:
-                raise RecordingError(f'{matrix.name}: {size} bytes exceed its limit of {limit}: '
-                                     'shorten it')
+            check_size(matrix.name, 4 * len(cells) * max(map(len, cells), default=0), limit,
+                       'shorten it')
             return np.array(cells)
         if matrix.kind == _CHAR:
             return self._text(data, matrix)
@@ -243,9 +241,7 @@ class _Reader:
     def _text(self, data: _Buffer, matrix: _Matrix) -> RawArray:
         """Return the rows of a character matrix."""
         part = self._element(data, matrix.content, matrix.stop)
-        if part.stop - part.start > MAX_FIELD_BYTES:
-            raise RecordingError(f'a text of {part.stop - part.start} bytes exceeds its limit of '
-                                 f'{MAX_FIELD_BYTES}')
+        check_size('a text', part.stop - part.start, MAX_FIELD_BYTES, 'shorten it')
         coding = _TEXTS[part.kind] + (
             {'<': '-le', '>': '-be'}[self._order] if part.kind in (4, 17, 18) else '')
         text = data[part.start:part.stop].decode(coding, 'replace')

@@ -197,12 +197,9 @@ class Recording:
             raise RecordingError(f'tach of {self.tach.channels} channels: must be one waveform')
         if self.tach_rate is not None:
             check_rate('tach_rate', self.tach_rate, RecordingError)
-        if self.pulses_per_revolution < 1:
-            raise RecordingError(
-                f'pulses_per_revolution {self.pulses_per_revolution}: must be at least 1')
-        if self.pulses_per_trigger is not None and self.pulses_per_trigger < 1:
-            raise RecordingError(
-                f'pulses_per_trigger {self.pulses_per_trigger}: must be at least 1')
+        for name in ('pulses_per_revolution', 'pulses_per_trigger'):
+            if (count := getattr(self, name)) is not None and count < 1:
+                raise RecordingError(f'{name} {count}: must be at least 1')
         if not 0 <= self.missing_teeth < self.pulses_per_revolution:
             raise RecordingError(
                 f'missing_teeth {self.missing_teeth}: must be from 0 to less than '
