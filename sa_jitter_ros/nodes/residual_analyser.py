@@ -197,8 +197,7 @@ class ResidualAnalyser(MonitoringNode):
             self.set_missing('declared model', f'{self._predictor_name} does not answer: '
                              'independent jitter without effects is assumed; start the node, or '
                              'set the parameter predictor to its name')
-            self._trace(averages, lambda: trace_averages(
-                averages, declared_by(averages, prediction)))
+            self._trace(averages, declared_by(averages, prediction))
 
         def ask(parameters: Sequence[Parameter], *others: Sequence[Parameter]) -> None:
             def answered(response: Any) -> None:
@@ -211,8 +210,7 @@ class ResidualAnalyser(MonitoringNode):
                     return
                 model, effects = self._declared(parameters, response)
                 self.set_missing('declared model', '')
-                self._trace(averages, lambda: trace_averages(
-                    averages, model, declared=effects))
+                self._trace(averages, model, effects)
             names = [item.name for item in parameters]
             self._request(lambda: self._predictor.get_parameters(names), answered, without)
 
@@ -232,9 +230,11 @@ class ResidualAnalyser(MonitoringNode):
         declaration = declaration_of(values)
         return declaration.model, declaration.effects
 
-    def _trace(self, averages: Sequence[ReceivedAverage], work: Callable[[], Trace]) -> None:
+    def _trace(self, averages: Sequence[ReceivedAverage], model: DeclaredModel,
+               effects: Sequence[Effect] = ()) -> None:
         """Trace averages in a thread, so that the executor is not blocked."""
-        job = _Job(work)
+        name_of = partial(self.parameters.machine.name_of, self._values['shaft'])
+        job = _Job(partial(trace_averages, averages, model, declared=effects, name_of=name_of))
         self._activity = 'tracing'
 
         def look() -> None:
