@@ -29,7 +29,7 @@ from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.gathering import clock_of
-from sa_jitter_ros.inference.observation import Acquisition, NameOf, nameless, Observation
+from sa_jitter_ros.inference.observation import Acquisition, nameless, NameOf, Observation
 from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench

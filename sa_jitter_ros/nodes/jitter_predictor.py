@@ -11,8 +11,9 @@
 """Node `jitter_predictor`: predicts how jitter changes each order of a synchronous average."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any
 
@@ -136,9 +137,7 @@ def prediction_message(prediction: Prediction) -> PredictionMessage:
     return PredictionMessage(table, speed, rate, int(cycles), ratio, pulse_error, noise)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(JitterPredictor, args)
+main = partial(run_node, JitterPredictor)
 
 
 if __name__ == '__main__':

@@ -10,7 +10,7 @@
 
 """Node `live_view`: a web page with the latest results of all nodes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 import json
 import math
@@ -22,7 +22,7 @@ from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.live_view_board import (
-    amplitude_rows, Board, CHANNELS, History, HISTORY, HISTORY_NUMBERS, INDICATORS,
+    amplitude_rows, Board, CHANNELS, HISTORY, History, HISTORY_NUMBERS, INDICATORS,
     indicators_content, OrderMap, ORDERS, orders_content, PulseErrors, pulses_content,
     spectrum_content, SPEEDS, table_content, Trend, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
@@ -263,9 +263,7 @@ class LiveView(MonitoringNode):
             'requests_refused': str(self._server.refused)}
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(LiveView, args)
+main = partial(run_node, LiveView)
 
 
 if __name__ == '__main__':

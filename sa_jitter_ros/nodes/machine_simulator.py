@@ -10,8 +10,9 @@
 
 """Node `machine_simulator`: publishes the signals of a simulated gearbox."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import count
 import math
 from typing import Any
@@ -227,9 +228,7 @@ class MachineSimulator(PlaybackNode):
         return f'{sent:.1f}{total} s sent'
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(MachineSimulator, args)
+main = partial(run_node, MachineSimulator)
 
 
 if __name__ == '__main__':

@@ -388,9 +388,7 @@ def average_of(message: AverageMessage) -> ReceivedAverage:
         table[..., 7])
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(ResidualAnalyser, args)
+main = partial(run_node, ResidualAnalyser)
 
 
 if __name__ == '__main__':

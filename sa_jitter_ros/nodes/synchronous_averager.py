@@ -13,6 +13,7 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -208,9 +209,7 @@ class SynchronousAverager(MonitoringNode):
         return f'{published} averages of {averager.counts.cycles} trigger cycles', values
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(SynchronousAverager, args)
+main = partial(run_node, SynchronousAverager)
 
 
 if __name__ == '__main__':

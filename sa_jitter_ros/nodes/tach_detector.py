@@ -11,8 +11,8 @@
 """Node `tach_detector`: the sampled keyphasor signal, or the angle of a joint, in; pulses out."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 import math
 from typing import Any
 
@@ -199,9 +199,7 @@ class TachDetector(MonitoringNode):
         return f'{self._pulses} pulses at threshold {state.threshold:.6g}', values
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(TachDetector, args)
+main = partial(run_node, TachDetector)
 
 
 if __name__ == '__main__':
