@@ -107,11 +107,11 @@ def planned(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
         state=options.state, tacholess=tacholess_options(options)), Row)
 
 
-def run(options: argparse.Namespace, progress: Progress, *, changes: list[Changes]) -> list[Row]:
+def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Changes | None]:
     """
     Average the recordings and write the tables; raises SaJitterError, OSError.
 
-    With a baseline, what has changed is added to `changes`.
+    Return what became of them and, with a baseline, what has changed.
     """
     settings = settings_for_changes(options)
     jobs, rows = planned(options)
@@ -129,24 +129,24 @@ def run(options: argparse.Namespace, progress: Progress, *, changes: list[Change
     finally:
         if any(row.averages for row in rows):
             write_tables(options.output, rows)
-    if settings is not None:
-        averaged = {row.recording for row in rows if row.averages}
-        found = find_changes(
-            options.output, [job.name for job in jobs if job.name in averaged], settings,
-            jobs[0].machine.machine, state=options.state)
-        write_changes(options.output, found, figure=not options.no_figures)
-        if not options.no_figures:
-            from sa_jitter_ros.offline.machine_page import PAGE, write_page
-            write_page(options.output / found.recordings[-1].name, found,
-                       place=options.output / PAGE)
-        changes.append(found)
-        for line in found.warnings():
-            progress.say(f'warning: {line}')
-    return rows
+    if settings is None:
+        return rows, None
+    averaged = {row.recording for row in rows if row.averages}
+    found = find_changes(
+        options.output, [job.name for job in jobs if job.name in averaged], settings,
+        jobs[0].machine.machine, state=options.state)
+    write_changes(options.output, found, figure=not options.no_figures)
+    if not options.no_figures:
+        from sa_jitter_ros.offline.machine_page import PAGE, write_page
+        write_page(options.output / found.recordings[-1].name, found, place=options.output / PAGE)
+    for line in found.warnings():
+        progress.say(f'warning: {line}')
+    return rows, found
 
 
-def tell(options: argparse.Namespace, rows: list[Row], *, changes: list[Changes]) -> int:
+def tell(options: argparse.Namespace, found: tuple[list[Row], Changes | None]) -> int:
     """Say how many recordings were averaged, and what changed; return 2 if none could be."""
+    rows, changes = found
     averaged = [row for row in rows if row.averages]
     if not averaged:
         return 2
@@ -155,17 +155,15 @@ def tell(options: argparse.Namespace, rows: list[Row], *, changes: list[Changes]
                 f'recording{"s" * (len(averaged) > 1)}'
                 + (f'; {failed} could not be averaged, or not wholly: see {RECORDINGS}'
                    if failed else ''),
-                *(line for found in changes for line in found.lines()),
-                f'written: {options.output}')
+                *(changes.lines() if changes else ()), f'written: {options.output}')
 
 
 @few_collections()
 def main(args: Sequence[str] | None = None) -> int:
     """Average recordings; return 0, or 2 after one line if none could be averaged."""
     options = make_parser().parse_args(args)
-    changes: list[Changes] = []
-    return run_to_end(partial(run, changes=changes), partial(tell, changes=changes), options,
-                      Progress('average', quiet=options.quiet), stopped=STOPPED)
+    return run_to_end(run, tell, options, Progress('average', quiet=options.quiet),
+                      stopped=STOPPED)
 
 
 if __name__ == '__main__':

@@ -77,8 +77,7 @@ def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
         work_through(loop_file, jobs, rows, failed=LoopRow, options=options, progress=progress)
     finally:
         if any(row.verdict for row in rows):
-            write_rows(options.output / LOOPS, sorted(
-                rows, key=lambda row: (row.recording, row.path)))
+            write_rows(options.output / LOOPS, rows)
     return rows
 
 

@@ -27,7 +27,7 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
@@ -62,6 +62,9 @@ class RecordingRow:
     recording: str
     path: str
     error: str = ''
+
+
+Row = TypeVar('Row', bound=RecordingRow)
 
 
 def row_values(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -219,16 +222,19 @@ def stamp(path: Path) -> list[list[Any]]:
         raise RecordingError(f'{path}: {error.strerror}: check the path') from None
 
 
-def write_rows(path: Path, rows: Sequence[Any]) -> None:
-    """Write dataclasses of one type as a table; raises OSError."""
+def write_rows(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """Write rows of recordings as a table, in the order of their names; return them so."""
+    ordered = sorted(rows, key=lambda row: (row.recording, row.path))
+
     def lines(file: TextIO) -> None:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(item.name for item in fields(rows[0]))
-        for row in rows:
+        for row in ordered:
             writer.writerow('; '.join(value) if isinstance(value, tuple) else value
                             for value in asdict(row).values())
 
     write_lines(path, lines)
+    return ordered
 
 
 def remove_unfinished(folder: Path) -> None:
