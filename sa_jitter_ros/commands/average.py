@@ -25,7 +25,7 @@ import sys
 
 from sa_jitter_ros.commands.command_line import (
     add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
-    Parser, read_options, run_to_end, show, tacholess_options)
+    Parser, read_options, run_to_end, show, tacholess_options, whole_from)
 from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
@@ -49,7 +49,7 @@ def make_parser() -> Parser:
     parser.add_argument('-p', '--param', action='append', default=[], dest='given',
                         metavar='NAME:=VALUE', help='parameter of synchronous_averager, as in '
                         'trigger_cycles:=60; overrides the file; may be repeated')
-    parser.add_argument('--baseline', type=_learning, metavar='N',
+    parser.add_argument('--baseline', type=whole_from(LEAST_LEARNED), metavar='N',
                         help='the recordings are those of one machine, in order of time, and the '
                         'first N of them (at least 8) its normal state: say what has changed '
                         f'since; -p also takes {", ".join(SETTINGS)}')
@@ -65,13 +65,6 @@ def make_parser() -> Parser:
     add_tacholess_options(parser)
     add_recording_options(parser)
     return parser
-
-
-def _learning(text: str) -> int:
-    """Return a number of recordings; argparse says which option is wrong."""
-    if not (text.isdecimal() and int(text) >= LEAST_LEARNED):
-        raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, {LEAST_LEARNED} or more')
-    return int(text)
 
 
 def settings_for_changes(options: argparse.Namespace) -> Settings | None:

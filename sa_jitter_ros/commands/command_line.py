@@ -193,17 +193,19 @@ def tacholess_options(options: argparse.Namespace) -> Tacholess | None:
 def add_fleet_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for many recordings: `jobs`, None if not given, and `scheduler`."""
     group = parser.add_argument_group('many recordings')
-    group.add_argument('--jobs', type=_count, metavar='N',
+    group.add_argument('--jobs', type=whole_from(1), metavar='N',
                        help='recordings at a time, each in a process of its own (1)')
     group.add_argument('--scheduler', default='', metavar='tcp://HOST:PORT',
                        help='Dask cluster whose workers do it; they must see the same files')
 
 
-def _count(text: str) -> int:
-    """Return a whole number of 1 or more; argparse says which option is wrong."""
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, 1 or more')
-    return int(text)
+def whole_from(least: int) -> Callable[[str], int]:
+    """Return what reads a whole number from the least on; argparse says which option is wrong."""
+    def read(text: str) -> int:
+        if not (text.isdecimal() and int(text) >= least):
+            raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, {least} or more')
+        return int(text)
+    return read
 
 
 def read_options(options: argparse.Namespace) -> dict[str, Any]:
