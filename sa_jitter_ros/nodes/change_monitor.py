@@ -10,6 +10,7 @@
 
 """Node `change_monitor`: tells whether the machine has changed, and keeps its baseline."""
 
+from collections.abc import Sequence
 from functools import partial
 import json
 import math
@@ -291,7 +292,9 @@ def baseline_path(file: str, machine: str, node: str) -> Path | None:
     return Path(os.path.expanduser(file))
 
 
-main = partial(run_node, ChangeMonitor)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(ChangeMonitor, args)
 
 
 if __name__ == '__main__':

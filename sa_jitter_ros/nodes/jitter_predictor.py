@@ -11,9 +11,8 @@
 """Node `jitter_predictor`: predicts how jitter changes each order of a synchronous average."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 import math
 from typing import Any
 
@@ -137,7 +136,9 @@ def prediction_message(prediction: Prediction) -> PredictionMessage:
     return PredictionMessage(table, speed, rate, int(cycles), ratio, pulse_error, noise)
 
 
-main = partial(run_node, JitterPredictor)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(JitterPredictor, args)
 
 
 if __name__ == '__main__':

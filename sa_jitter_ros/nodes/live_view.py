@@ -10,7 +10,7 @@
 
 """Node `live_view`: a web page with the latest results of all nodes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 import json
 import math
@@ -263,7 +263,9 @@ class LiveView(MonitoringNode):
             'requests_refused': str(self._server.refused)}
 
 
-main = partial(run_node, LiveView)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(LiveView, args)
 
 
 if __name__ == '__main__':

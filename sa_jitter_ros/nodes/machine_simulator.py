@@ -10,9 +10,8 @@
 
 """Node `machine_simulator`: publishes the signals of a simulated gearbox."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import count
 import math
 from typing import Any
@@ -228,7 +227,9 @@ class MachineSimulator(PlaybackNode):
         return f'{sent:.1f}{total} s sent'
 
 
-main = partial(run_node, MachineSimulator)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(MachineSimulator, args)
 
 
 if __name__ == '__main__':

@@ -376,7 +376,9 @@ def average_of(message: AverageMessage) -> ReceivedAverage:
         table[..., 7])
 
 
-main = partial(run_node, ResidualAnalyser)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(ResidualAnalyser, args)
 
 
 if __name__ == '__main__':

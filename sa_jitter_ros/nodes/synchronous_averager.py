@@ -13,7 +13,6 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -209,7 +208,9 @@ class SynchronousAverager(MonitoringNode):
         return f'{published} averages of {averager.counts.cycles} trigger cycles', values
 
 
-main = partial(run_node, SynchronousAverager)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(SynchronousAverager, args)
 
 
 if __name__ == '__main__':

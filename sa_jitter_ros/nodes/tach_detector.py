@@ -12,7 +12,7 @@
 
 from collections import deque
 from dataclasses import replace
-from functools import partial
+from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -199,7 +199,9 @@ class TachDetector(MonitoringNode):
         return f'{self._pulses} pulses at threshold {state.threshold:.6g}', values
 
 
-main = partial(run_node, TachDetector)
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(TachDetector, args)
 
 
 if __name__ == '__main__':

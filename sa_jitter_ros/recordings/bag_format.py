@@ -167,9 +167,10 @@ class _BlockRun:
 @contextmanager
 def _reader(path: Path) -> Iterator[Any]:
     """Open a bag; `rosbags` must not compile the message definitions in it."""
-    rosbag2 = library('rosbags.rosbag2', 'bags are', 'rosbags', 'bags')
+    with library('bags are', 'rosbags', 'bags'):
+        from rosbags.rosbag2 import Reader
     check_bag(path)
-    with rosbag2.Reader(path) as reader:
+    with Reader(path) as reader:
         if reader.compression_mode == 'message':
             raise RecordingError('messages are compressed one by one: convert the bag with ros2 '
                                  'bag convert to compressed files, or to no compression')

@@ -44,8 +44,9 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
     `struct/k/variable`. Raises RecordingError if h5py is not
     installed, the file is broken, or a variable has the wrong class.
     """
-    h5py = library('h5py', 'MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
-                   ", or save the file with '-v7'")
+    with library('MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
+                 ", or save the file with '-v7'"):
+        import h5py
     with h5py.File(path, 'r') as file:
         variables = dict(islice(_datasets(file, file, '', ()), _MOST_KEYS))
         return recording_from_fields(

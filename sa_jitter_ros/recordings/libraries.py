@@ -10,25 +10,27 @@
 
 """Libraries that read one format of recordings and are optional dependencies."""
 
-from importlib import import_module
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from sa_jitter_ros.errors import RecordingError
 
 
-def library(module: str, reads: str, name: str, extra: str, otherwise: str = '') -> Any:
+@contextmanager
+def library(reads: str, name: str, extra: str, otherwise: str = '') -> Iterator[None]:
     """
-    Return the module of a library; raises RecordingError that says how to install it.
+    Raise RecordingError that says how to install a library if an import within it fails.
 
     `reads` is what it reads, `extra` the one of this package that installs it.
 
-    >>> library('no_such', 'bags are', 'rosbags', 'bags')  # doctest: +ELLIPSIS
+    >>> with library('bags are', 'rosbags', 'bags'):  # doctest: +ELLIPSIS
+    ...     import no_such
     Traceback (most recent call last):
     ...
     sa_jitter_ros.errors.RecordingError: bags are read with rosbags, which is not installed: ...
     """
     try:
-        return import_module(module)
+        yield
     except ImportError:
         raise RecordingError(f'{reads} read with {name}, which is not installed: pip install '
                              f"'sa_jitter_ros[{extra}]' or {name}{otherwise}") from None

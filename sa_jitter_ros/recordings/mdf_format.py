@@ -33,7 +33,8 @@ def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
 
     Raises RecordingError if asammdf is not installed or the file is broken.
     """
-    asammdf = library('asammdf', 'a .mf4 file is', 'asammdf', 'mdf')
+    with library('a .mf4 file is', 'asammdf', 'mdf'):
+        import asammdf
     left_out: list[str] = []
     with asammdf.MDF(path) as file:
         channels = list(_channels(file, left_out))

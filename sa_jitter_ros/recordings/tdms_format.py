@@ -43,7 +43,8 @@ def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None)
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    nptdms = library('nptdms', 'a .tdms file is', 'npTDMS', 'tdms')
+    with library('a .tdms file is', 'npTDMS', 'tdms'):
+        import nptdms
     with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
         yield file
 

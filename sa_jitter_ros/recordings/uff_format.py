@@ -37,7 +37,8 @@ def open_uff(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
 
     Raises RecordingError if pyuff is not installed or the file is broken.
     """
-    pyuff = library('pyuff', 'a universal file is', 'pyuff', 'uff')
+    with library('a universal file is', 'pyuff', 'uff'):
+        import pyuff
     if path.stat().st_size > 8 * MAX_VALUES:
         raise RecordingError(f'{path.stat().st_size} bytes: universal files of at most '
                              f'{8 * MAX_VALUES} are read; export .tdms, .mat or .wav')
