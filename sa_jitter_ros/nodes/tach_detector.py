@@ -11,8 +11,8 @@
 """Node `tach_detector`: the sampled keyphasor signal, or the angle of a joint, in; pulses out."""
 
 from collections import deque
-from dataclasses import replace
 from collections.abc import Sequence
+from dataclasses import replace
 import math
 from typing import Any
 
