@@ -29,7 +29,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.recordings import read
-from sa_jitter_ros.recordings.channel_map import ChannelSelection
+from sa_jitter_ros.recordings.channel_map import with_channels
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import stats
@@ -79,12 +79,7 @@ def gear0(clock: float, channels: Sequence[int] = ()) -> Callable[[Path], Record
     """Return what opens the gearbox with its keyphasor timed by a slower clock."""
     def made(data: Path) -> Recording:
         recording = with_slower_clock(read(data / 'gear0_gearbox.npz'), clock)
-        if not channels:
-            return recording
-        rows = tuple(channels)
-        return replace(recording, vibration=ChannelSelection(recording.vibration, rows),
-                       channel_names=tuple(recording.channel_names[k] for k in rows),
-                       units=tuple(recording.units[k] for k in rows))
+        return with_channels(recording, channels) if channels else recording
     return made
 
 

@@ -28,8 +28,8 @@ from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
 from sa_jitter_ros.machine import following, Machine, PREFIX, UNKNOWN
 from sa_jitter_ros.parameter_file import one_line, read_parameters
 from sa_jitter_ros.parameters import (
-    HARDWARE_ID, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
-    STALE_AFTER, TRIGGER_CYCLES)
+    converted, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
+    TRIGGER_CYCLES, unknown_names)
 from sa_jitter_ros.prediction.model import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
@@ -153,14 +153,9 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         if values and not known.keys() & (found | values).keys():
             raise ModelError(f'none of {", ".join(values)} is a parameter of {NODE}: give the '
                              f'parameter file of {NODE}')
-        converted = {name: known[name].convert(value)
-                     for name, value in (found | values).items() if name in known}
-        if not converted.get('sample_rate'):
-            converted['sample_rate'] = sample_rate
-        declaration = declaration_of(converted)
+        taken = converted(found | values, known)
+        taken['sample_rate'] = taken.get('sample_rate') or sample_rate
+        declaration = declaration_of(taken)
     except SaJitterError as error:
         raise ModelError(f'{path}: {one_line(error)}') from error
-    others = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)  # of the node, not of the model
-    unknown = sorted(name for name in values if name not in (*known, *others)
-                     and not name.startswith('qos_overrides.'))
-    return replace(declaration, unknown=tuple(unknown), machine=machine)
+    return replace(declaration, unknown=unknown_names(values, known), machine=machine)

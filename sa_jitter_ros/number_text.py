@@ -30,7 +30,7 @@ def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
     Return a value with two digits of its standard error, in a unit that suits its size.
 
     Lists have an error for each value, or one for all. Without error, or where it is but rounding,
-    there are three digits, all of a number that is whole.
+    there are three digits, all of a number that is whole. A text stays as it is.
 
     >>> measured_text(8.042e-05, 6.92e-06, 's')
     '80.4 ± 6.9 µs'
@@ -38,8 +38,8 @@ def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
     '3300 Hz'
     >>> measured_text([0.0061, -0.0042], 0.00021, 'rad')
     '6.10 ± 0.21, -4.20 ± 0.21 mrad'
-    >>> measured_text(0.01931, 0.00131, '1'), measured_text(None)
-    ('0.0193 ± 0.0013', '–')
+    >>> measured_text(0.01931, 0.00131, '1'), measured_text(None), measured_text([19.0, 38.0])
+    ('0.0193 ± 0.0013', '–', '19, 38')
     >>> measured_text(280835514.3, None, 'Hz'), measured_text(5.41e12, None, 'Hz')
     ('281 MHz', '5.41 THz')
     >>> measured_text(163.0596441, 1.2e-6, 'Hz')
@@ -66,16 +66,6 @@ def percent_text(value: Json, error: Json = None, *, shown: bool = True) -> str:
         return '–'
     text = measured_text(100.0 * value, None if error is None else 100.0 * error, '%')
     return text if shown else text.partition(' ')[0] + ' %'
-
-
-def number_text(value: Json) -> str:
-    """
-    Return a number, a text or a list of them, with three digits, whole numbers with all.
-
-    >>> number_text(0.000212760), number_text(51200.0), number_text([19.0, 38.0])
-    ('0.000213', '51200', '19, 38')
-    """
-    return measured_text(value)
 
 
 def order_text(order: float, name: str = '') -> str:

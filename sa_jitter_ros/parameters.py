@@ -15,7 +15,7 @@ A `Parameter` converts and checks values; `nodes/parameters.py` declares it to R
 `whole_number` and `numbers` check the arguments of library functions.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from numbers import Integral, Real
@@ -188,6 +188,21 @@ HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in the diagnosti
                         'of this computer')
 STALE_AFTER = Parameter('stale_after', 5.0, 'silence of an input that is a warning, three times '
                         'as long an error; 0: never', unit='s', minimum=0.0, maximum=1e6)
+
+
+#: Parameters of a node that say nothing of what it computes.
+_OF_NODE = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)
+
+
+def converted(values: Mapping[str, Any], known: Mapping[str, Parameter]) -> Values:
+    """Return the converted values of `known` parameters; raises ParameterError."""
+    return {name: known[name].convert(value) for name, value in values.items() if name in known}
+
+
+def unknown_names(values: Mapping[str, Any], known: Mapping[str, Parameter]) -> tuple[str, ...]:
+    """Return the names that are neither those of `known` parameters nor of any node."""
+    return tuple(sorted(name for name in values if name not in (*known, *_OF_NODE)
+                        and not name.startswith('qos_overrides.')))
 
 
 def sample_parameters(topic: str) -> tuple[Parameter, ...]:

@@ -18,7 +18,7 @@ import sys
 from bench import SteadyClock
 import numpy as np
 import pytest
-from sa_jitter_ros.commands import check_keyphasor, close_loop, loop_run, progress
+from sa_jitter_ros.commands import average, check_keyphasor, close_loop, loop_run, progress
 from sa_jitter_ros.parameter_file import shipped
 
 
@@ -50,6 +50,13 @@ def test_loop_refuses_a_folder_that_it_cannot_write_before_it_reads(tmp_path, ca
     assert [item.name for item in tmp_path.iterdir()] == ['file']
 
 
+@pytest.mark.parametrize('option', ['-p state_bin:=3', '--state load'])
+def test_what_the_change_monitor_takes_needs_a_baseline(tmp_path, capsys, option):
+    assert average.main(['rig.npz', '--output', str(tmp_path), *option.split()]) == 2
+    assert capsys.readouterr().err == (
+        f'average: {option.removesuffix(" load")} needs --baseline\n')
+
+
 def test_stopped_loop_says_so_in_one_line_and_writes_nothing(tmp_path, capsys, monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
@@ -67,9 +74,10 @@ def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypat
     command = [str(tmp_path / 'rig.npz'), '--output', str(tmp_path), '--params',
                str(shipped('machine.yaml'))]
     parser = check_keyphasor.make_parser()
-    found, _ = check_keyphasor.run(parser.parse_args(command))
+    quiet = progress.Progress('check_keyphasor', quiet=True)
+    found, _ = check_keyphasor.run(parser.parse_args(command), quiet)
     assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (183 / 76, 19.0, 1)
-    found, _ = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']))
+    found, _ = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']), quiet)
     assert (found.ratio, found.orders[0]) == (3.0, 19.0)
 
 

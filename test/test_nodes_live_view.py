@@ -464,7 +464,7 @@ def test_connections_that_drip_are_ended_and_the_page_stays(bench, monkeypatch):
     slow = [socket.create_connection(('127.0.0.1', b.port)) for _ in range(server.CONNECTIONS)]
     for connection in slow:
         connection.sendall(b'GET / HT')
-    assert b.spin(lambda: len(b.node._server._server._deadlines) == len(slow))
+    assert b.spin(lambda: len(b.node._server._deadlines) == len(slow))
     clock.now += server.REQUEST_SECONDS / 2
     slow[0].sendall(b'TP/1.1\r\nHost: localhost\r\n\r\n')  # this one arrives in time
     assert slow[0].recv(100).startswith(b'HTTP')
@@ -482,7 +482,7 @@ def test_a_request_takes_the_place_of_the_slowest_connection(bench):
     slow = [socket.create_connection(('127.0.0.1', b.port)) for _ in range(server.CONNECTIONS)]
     for connection in slow:
         connection.sendall(b'GET / HT')
-    assert b.spin(lambda: len(b.node._server._server._asking) == len(slow))
+    assert b.spin(lambda: len(b.node._server._asking) == len(slow))
     assert b.ask('/')[0] == 200
     assert slow[0].recv(100) == b''
     slow[1].sendall(b'TP/1.1\r\nHost: localhost\r\n\r\n')

@@ -153,7 +153,9 @@ def test_trace_names_the_effect_and_its_size():
 
 
 def test_trace_finds_the_grid_of_a_clock():
-    found = trace_averages(synthetic(20, grid=4000.0), MODEL)
+    found = trace_averages(synthetic(20, grid=4000.0), MODEL, name_of='mesh {:g}'.format)
+    assert {item['name'] for item in report(found)['lines']} == {
+        f'mesh {order:g}' for order in MODEL.orders}
     assert found.verdict == 'traced'
     assert [item.name for item in found.findings] == ['keyphasor_quantisation']
     assert found.findings[0].effect.clock_rate == pytest.approx(4000.0, rel=1e-6)

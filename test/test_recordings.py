@@ -483,7 +483,7 @@ def test_a_text_that_is_too_long_is_refused(tmp_path):
     path = tmp_path / 'text.mat'
     scipy.io.savemat(path, {'vibration': np.zeros((1, 9)), 'sample_rate': 1.0,
                             'units': np.array(['a' * (1 << 20) + 'a'], dtype=object)})
-    with pytest.raises(RecordingError, match='a text of 1048577 bytes exceeds its limit'):
+    with pytest.raises(RecordingError, match='a text: 1048577 bytes exceed its limit'):
         read(path)
 
 

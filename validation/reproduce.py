@@ -38,8 +38,7 @@ _FEWEST = {'iterations': 1000, 'simulations': 2}
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='reproduce', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('reproduce', __doc__)
     parser.add_argument('--output', type=Path, default=Path('validation'), metavar='DIR',
                         help='folder to write into, made if missing (validation)')
     parser.add_argument('--quick', action='store_true',

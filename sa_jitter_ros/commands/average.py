@@ -20,14 +20,13 @@ the machine has changed since the first N recordings, in changes.json, changes.p
 import argparse
 from collections.abc import Sequence
 from functools import partial
-import os
 from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, Parser,
-    read_options, show, tacholess_options)
-from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
+    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
+    Parser, read_options, run_to_end, show, tacholess_options, whole_from)
+from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.change_test import LEAST_LEARNED
@@ -41,18 +40,16 @@ from sa_jitter_ros.recordings.fields import fields_of
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='average', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('average', __doc__)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2, or a '
-                        'folder of them')
+                        help=f'{FORMATS}, or a folder of them')
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of the machine; without: settings are chosen from '
                         'each recording')
     parser.add_argument('-p', '--param', action='append', default=[], dest='given',
                         metavar='NAME:=VALUE', help='parameter of synchronous_averager, as in '
                         'trigger_cycles:=60; overrides the file; may be repeated')
-    parser.add_argument('--baseline', type=_learning, metavar='N',
+    parser.add_argument('--baseline', type=whole_from(LEAST_LEARNED), metavar='N',
                         help='the recordings are those of one machine, in order of time, and the '
                         'first N of them (at least 8) its normal state: say what has changed '
                         f'since; -p also takes {", ".join(SETTINGS)}')
@@ -70,24 +67,18 @@ def make_parser() -> Parser:
     return parser
 
 
-def _learning(text: str) -> int:
-    """Return a number of recordings; argparse says which option is wrong."""
-    if not (text.isdecimal() and int(text) >= LEAST_LEARNED):
-        raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, {LEAST_LEARNED} or more')
-    return int(text)
-
-
 def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     """
     Return the settings of the change monitor, None without a baseline; raises ParameterError.
 
     Its parameters are taken out of the given ones.
     """
-    if options.baseline is None:
-        if options.state:
-            raise ParameterError('--state needs --baseline')
-        return None
     of_monitor = [text for text in options.given if text.partition(':=')[0] in SETTINGS]
+    if options.baseline is None:
+        needing = [*['--state'] * bool(options.state), *(f'-p {text}' for text in of_monitor)]
+        if needing:
+            raise ParameterError(f'{needing[0]} needs --baseline')
+        return None
     options.given = [text for text in options.given if text not in of_monitor]
     settings = settings_of(options.params, of_monitor, options.baseline)
     if settings.uses_state != bool(options.state):
@@ -97,30 +88,26 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     return settings
 
 
-def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
+def planned(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
     """Return the jobs, and rows of recordings that cannot have one; raises ParameterError."""
     machine = MachineFile.read(options.params, options.given)
     if machine.unknown:
         print(f'average: {options.params}: ignored, because synchronous_averager has no such '
               f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
-    tacholess = tacholess_options(options)
-    found = recordings_of(options)
-    output = options.output.absolute()
-    keywords, fields = read_options(options), tuple(fields_of(options.fields))
-    return [AverageJob(
-        item.name, os.path.abspath(item.path), str(output / item.name), machine, keywords, fields,
-        not options.no_figures, options.state, tacholess) for item in found if not item.error], [
-            Row(item.name, str(item.path), item.error) for item in found if item.error]
+    return jobs_of(options, partial(
+        AverageJob, machine=machine, options=read_options(options),
+        fields=tuple(fields_of(options.fields)), figures=not options.no_figures,
+        state=options.state, tacholess=tacholess_options(options)), Row)
 
 
-def run(options: argparse.Namespace, progress: Progress, *, changes: list[Changes]) -> list[Row]:
+def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Changes | None]:
     """
     Average the recordings and write the tables; raises SaJitterError, OSError.
 
-    With a baseline, what has changed is added to `changes`.
+    Return what became of them and, with a baseline, what has changed.
     """
     settings = settings_for_changes(options)
-    jobs, rows = jobs_of(options)
+    jobs, rows = planned(options)
 
     def alone(job: AverageJob) -> Row:
         done = len(rows)
@@ -135,24 +122,24 @@ def run(options: argparse.Namespace, progress: Progress, *, changes: list[Change
     finally:
         if any(row.averages for row in rows):
             write_tables(options.output, rows)
-    if settings is not None:
-        averaged = {row.recording for row in rows if row.averages}
-        found = find_changes(
-            options.output, [job.name for job in jobs if job.name in averaged], settings,
-            jobs[0].machine.machine, state=options.state)
-        write_changes(options.output, found, figure=not options.no_figures)
-        if not options.no_figures:
-            from sa_jitter_ros.offline.machine_page import PAGE, write_page
-            write_page(options.output / found.recordings[-1].name, found,
-                       place=options.output / PAGE)
-        changes.append(found)
-        for line in found.warnings():
-            progress.say(f'warning: {line}')
-    return rows
+    if settings is None:
+        return rows, None
+    averaged = {row.recording for row in rows if row.averages}
+    found = find_changes(
+        options.output, [job.name for job in jobs if job.name in averaged], settings,
+        jobs[0].machine.machine, state=options.state)
+    write_changes(options.output, found, figure=not options.no_figures)
+    if not options.no_figures:
+        from sa_jitter_ros.offline.machine_page import PAGE, write_page
+        write_page(options.output / found.recordings[-1].name, found, place=options.output / PAGE)
+    for line in found.warnings():
+        progress.say(f'warning: {line}')
+    return rows, found
 
 
-def tell(options: argparse.Namespace, rows: list[Row], *, changes: list[Changes]) -> int:
+def tell(options: argparse.Namespace, found: tuple[list[Row], Changes | None]) -> int:
     """Say how many recordings were averaged, and what changed; return 2 if none could be."""
+    rows, changes = found
     averaged = [row for row in rows if row.averages]
     if not averaged:
         return 2
@@ -161,17 +148,15 @@ def tell(options: argparse.Namespace, rows: list[Row], *, changes: list[Changes]
                 f'recording{"s" * (len(averaged) > 1)}'
                 + (f'; {failed} could not be averaged, or not wholly: see {RECORDINGS}'
                    if failed else ''),
-                *(line for found in changes for line in found.lines()),
-                f'written: {options.output}')
+                *(changes.lines() if changes else ()), f'written: {options.output}')
 
 
 @few_collections()
 def main(args: Sequence[str] | None = None) -> int:
     """Average recordings; return 0, or 2 after one line if none could be averaged."""
     options = make_parser().parse_args(args)
-    changes: list[Changes] = []
-    return run_to_end(partial(run, changes=changes), partial(tell, changes=changes), options,
-                      Progress('average', quiet=options.quiet))
+    return run_to_end(run, tell, options, Progress('average', quiet=options.quiet),
+                      stopped=STOPPED)
 
 
 if __name__ == '__main__':

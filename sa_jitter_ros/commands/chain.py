@@ -15,7 +15,6 @@ It needs a third of the memory of three processes. Arguments behind --ros-args a
 the nodes keep their names where one is given to the chain, whose section in a file is for all.
 """
 
-import argparse
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -31,8 +30,7 @@ OTHERS = ('change_monitor', 'live_view', 'tach_detector')
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='chain', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('chain', __doc__)
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of all nodes')
     parser.add_argument('--with', dest='others', nargs='+', choices=OTHERS, default=(),

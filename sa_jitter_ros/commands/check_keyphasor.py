@@ -26,16 +26,15 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, add_tacholess_options, Parser, read_options, require_writable, show,
+    add_recording_options, add_tacholess_options, FORMATS, Parser, read_options, run_to_end, show,
     tacholess_options)
+from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE, read_declaration
-from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.machine import Machine
-from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read
@@ -44,11 +43,10 @@ from sa_jitter_ros.recordings.recording import Recording
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='check_keyphasor', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('check_keyphasor', __doc__)
     parser.add_argument('recording', type=Path, metavar='RECORDING',
-                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2; a .npz '
-                        'or .mat with pulse times only is examined without vibration')
+                        help=f'{FORMATS}; a .npz or .mat with pulse times only is examined '
+                        'without vibration')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for keyphasor.json, machine.yaml and the figures')
     parser.add_argument('--teeth', type=int, nargs='+', default=(), metavar='N',
@@ -81,50 +79,50 @@ def _declared(params: Path | None) -> Mapping[str, Any]:
     return {} if params is None else read_parameters(params, NODE)
 
 
-def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
+def run(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorCheck, Recording]:
     """Check the recording, and return both; raises SaJitterError."""
-    def progress(text: str) -> None:
-        if not options.quiet:
-            print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
-
     recording = read(options.recording, pulses_suffice=True,
                      **{**_machine_fields(options.params), **read_options(options)})
     machine = Machine.among(_declared(options.params))
     if tacholess := tacholess_options(options):
         recording, _ = tacholess.pulses_of(recording, machine)
     for remark in recording.remarks:
-        progress(remark)
+        progress.step(remark)
     return check_keyphasor(recording, teeth=options.teeth, machine=machine,
-                           progress=progress), recording
+                           progress=progress.step), recording
+
+
+def write(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorCheck, list[str]]:
+    """Check the recording and write all files; return their names, too."""
+    found, recording = run(options, progress)
+    options.output.mkdir(parents=True, exist_ok=True)
+    report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
+    (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
+    (options.output / 'machine.yaml').write_text(
+        machine_file(found, options.recording.name, _declared(options.params)),
+        encoding='utf-8')
+    check_figure(found, options.recording.name).savefig(
+        options.output / 'keyphasor.png', dpi=110)
+    fitted = found.fitted
+    repaired = write_repairs(
+        options.output, options.recording.name, recording,
+        np.union1d(fitted.true, fitted.strays),
+        [*((time, 'early') for time in fitted.strays.tolist()),
+         *((time, 'missing') for time in fitted.lost.tolist())])
+    return found, ['keyphasor.json', 'machine.yaml', 'keyphasor.png', *['repairs.png'] * repaired]
+
+
+def tell(options: argparse.Namespace, written: tuple[KeyphasorCheck, list[str]]) -> int:
+    """Say what was found, and the names of the files."""
+    found, names = written
+    files = ', '.join(str(options.output / name) for name in names)
+    return show('check_keyphasor', found, f'written: {files}')
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Check a keyphasor; return 0, or 2 after one line on unusable input or output."""
     options = make_parser().parse_args(args)
-    try:
-        require_writable(options.output)
-        use_one_thread()
-        found, recording = run(options)
-        options.output.mkdir(parents=True, exist_ok=True)
-        report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
-        (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
-        (options.output / 'machine.yaml').write_text(
-            machine_file(found, options.recording.name, _declared(options.params)),
-            encoding='utf-8')
-        check_figure(found, options.recording.name).savefig(
-            options.output / 'keyphasor.png', dpi=110)
-        fitted = found.fitted
-        files = ['keyphasor.json', 'machine.yaml', 'keyphasor.png']
-        files += ['repairs.png'] * write_repairs(
-            options.output, options.recording.name, recording,
-            np.union1d(fitted.true, fitted.strays),
-            [*((time, 'early') for time in fitted.strays.tolist()),
-             *((time, 'missing') for time in fitted.lost.tolist())])
-    except (SaJitterError, OSError) as error:
-        print(f'check_keyphasor: {" ".join(str(error).split())}', file=sys.stderr)
-        return 2
-    written = ', '.join(str(options.output / name) for name in files)
-    return show('check_keyphasor', found, f'written: {written}')
+    return run_to_end(write, tell, options, Progress('check_keyphasor', quiet=options.quiet))
 
 
 if __name__ == '__main__':

@@ -20,26 +20,21 @@ Several recordings are those of one machine and make one report. With a folder, 
 recordings that were finished before are skipped.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, add_tacholess_options, failure, few_collections,
-    Parser, plain_warnings, require_writable, show)
+    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
+    Parser)
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import SaJitterError
 
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='close_loop', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('close_loop', __doc__)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                        help='recordings of one machine: .npz, .mat, .wav, .csv, .tdms, .mf4, '
-                        '.uff or rosbag2; or '
-                        'folders of recordings')
+                        help=f'recordings of one machine: {FORMATS}; or folders of recordings')
     parser.add_argument('--declared', '--params', type=Path, required=True, metavar='MODEL.yaml',
                         help='ROS parameter file of jitter_predictor, or of the whole machine')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
@@ -57,22 +52,8 @@ def main(args: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(args)
     progress = Progress('close_loop', quiet=options.quiet)
     with progress.ticking():  # what does the work takes a second to load
-        from sa_jitter_ros.commands.loop_run import is_fleet, run, show_fleet
-    if is_fleet(options):
-        return show_fleet(options, progress)
-    try:
-        require_writable(options.output)
-        with plain_warnings('close_loop'), progress.ticking():
-            found = run(options, progress)
-            progress.step('writing the report')
-            found.write(options.output)
-    except (SaJitterError, OSError) as error:
-        progress.say(failure(error, options.output))
-        return 2
-    except KeyboardInterrupt:
-        progress.say('stopped before the report was written')
-        return 130
-    return show('close_loop', found, f'report: {options.output / "report.html"}')
+        from sa_jitter_ros.commands.loop_run import is_fleet, show_fleet, show_report
+    return (show_fleet if is_fleet(options) else show_report)(options, progress)
 
 
 if __name__ == '__main__':

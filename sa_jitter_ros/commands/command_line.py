@@ -11,30 +11,41 @@
 """Command lines: a parser with errors of one line, and the options of commands for recordings."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 import gc
 from io import UnsupportedOperation
 import os
 from pathlib import Path
+import signal
 import sys
 import tempfile
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 import warnings
 
-from sa_jitter_ros.errors import DataWarning, ParameterError
+from sa_jitter_ros.commands.progress import Progress
+from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.settings import AVERAGER, section
 from sa_jitter_ros.recordings.channel_units import channels_of
 from sa_jitter_ros.recordings.fields import fields_of
 from sa_jitter_ros.tacholess.recording import Tacholess
 
+Found = TypeVar('Found')
+
+FORMATS = '.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2'
 _OBJECTS = 1_000_000  # new ones after which Python looks for garbage, as a rule 700
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
 _READ_OPTIONS = ('acquisition', 'sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser with a text of its own lines, whose errors are one line."""
+
+    def __init__(self, prog: str | None = None, description: str | None = None, **others: Any
+                 ) -> None:
+        super().__init__(prog, description=description,
+                         formatter_class=argparse.RawDescriptionHelpFormatter, **others)
 
     def error(self, message: str) -> NoReturn:
         """Print the error and exit with status 2."""
@@ -58,12 +69,31 @@ def show(program: str, *lines: object) -> int:
     return 0
 
 
-def failure(error: Exception, output: Path) -> str:
-    """Return one line for an error that ended a command which writes into the folder `output`."""
-    if isinstance(error, OSError) and error.strerror:
-        return (f'{error.filename or output}: {error.strerror}: make room, or give another '
-                'folder; what was finished stays')
-    return ' '.join(str(error).split())
+def run_to_end(run: Callable[[argparse.Namespace, Progress], Found],
+               tell: Callable[[argparse.Namespace, Found], int],
+               options: argparse.Namespace, progress: Progress, *,
+               stopped: str = 'stopped') -> int:
+    """
+    Run what finds something and writes into `options.output`, and `tell` it; return the status.
+
+    It is 2 after one line for what cannot be used or written, 130 for SIGINT and SIGTERM.
+    """
+    use_one_thread()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        require_writable(options.output)
+        found = run(options, progress)
+    except OSError as error:
+        progress.say(f'{error.filename or options.output}: {error.strerror}: make room, or give '
+                     'another folder; what was finished stays' if error.strerror else str(error))
+        return 2
+    except SaJitterError as error:
+        progress.say(' '.join(str(error).split()))
+        return 2
+    except KeyboardInterrupt:
+        progress.say(stopped)
+        return 130
+    return tell(options, found)
 
 
 def discard_output() -> None:
@@ -163,17 +193,19 @@ def tacholess_options(options: argparse.Namespace) -> Tacholess | None:
 def add_fleet_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for many recordings: `jobs`, None if not given, and `scheduler`."""
     group = parser.add_argument_group('many recordings')
-    group.add_argument('--jobs', type=_count, metavar='N',
+    group.add_argument('--jobs', type=whole_from(1), metavar='N',
                        help='recordings at a time, each in a process of its own (1)')
     group.add_argument('--scheduler', default='', metavar='tcp://HOST:PORT',
                        help='Dask cluster whose workers do it; they must see the same files')
 
 
-def _count(text: str) -> int:
-    """Return a whole number of 1 or more; argparse says which option is wrong."""
-    if not (text.isdecimal() and int(text) > 0):
-        raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, 1 or more')
-    return int(text)
+def whole_from(least: int) -> Callable[[str], int]:
+    """Return what reads a whole number from the least on; argparse says which option is wrong."""
+    def read(text: str) -> int:
+        if not (text.isdecimal() and int(text) >= least):
+            raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, {least} or more')
+        return int(text)
+    return read
 
 
 def read_options(options: argparse.Namespace) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, discard_output, Parser, player_options, read_options)
+    add_recording_options, discard_output, FORMATS, Parser, player_options, read_options)
 from sa_jitter_ros.commands.demo_plan import (
     Plan, plan_doubts, plan_recording, plan_simulation, with_machine)
 from sa_jitter_ros.commands.demo_report import write_results
@@ -291,11 +291,9 @@ def write_report(plan: Plan, watcher: Watcher, output: Path) -> None:
 
 def _parser() -> Parser:
     """Return the parser of the options."""
-    parser = Parser(
-        prog='demo', description='Average a recording, or a simulated gearbox, over ROS topics.')
+    parser = Parser('demo', 'Average a recording, or a simulated gearbox, over ROS topics.')
     parser.add_argument('recording', nargs='?', type=Path,
-                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2; without: '
-                        'a simulated gearbox')
+                        help=f'{FORMATS}; without: a simulated gearbox')
     parser.add_argument('--keyphasor-rate', type=float, default=0.0, metavar='HZ',
                         help='round pulse times up to a clock of this rate, as if the keyphasor '
                         'had been sampled with it')

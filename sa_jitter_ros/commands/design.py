@@ -56,8 +56,7 @@ _LEAST_SHARE = 1e-6  # drawn for an exact notch, whose share is 0
 
 def make_parser() -> Parser:
     """Return the parser of the command line; its names are the keywords of `design`."""
-    parser = Parser(prog='design', description=__doc__, epilog=EXAMPLES,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('design', __doc__, epilog=EXAMPLES)
     machine = parser.add_argument_group('machine and average')
     machine.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                          help='ROS parameter file with a section of jitter_predictor: the '

@@ -12,89 +12,38 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+import os
 from pathlib import Path
-import signal
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from sa_jitter_ros.commands.command_line import failure, require_writable
+from sa_jitter_ros.commands.command_line import FORMATS
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import ParameterError, SaJitterError
-from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.offline.files import remove_unfinished
-from sa_jitter_ros.offline.fleet import find_recordings, Found, run_jobs
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, remove_unfinished
+from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
 from sa_jitter_ros.offline.processes import Failure
 
 
-class Job(Protocol):
-    """A recording, its name in the results, and the folder of its files."""
-
-    @property
-    def name(self) -> str:
-        """Return the name in the results."""
-
-    @property
-    def path(self) -> str:
-        """Return the path of the recording."""
-
-    @property
-    def folder(self) -> str:
-        """Return the folder of its files."""
+Work = TypeVar('Work', bound=RecordingJob)
+Row = TypeVar('Row', bound=RecordingRow)
+STOPPED = 'stopped; what was finished stays, the same command goes on from there'
 
 
-class Result(Protocol):
-    """What became of a recording."""
+def jobs_of(options: argparse.Namespace, job: Callable[[str, str, str], Work],
+            failed: Callable[[str, str, str], Row]) -> tuple[list[Work], list[Row]]:
+    """
+    Return a job for each recording of a command line, and rows of those that cannot have one.
 
-    @property
-    def recording(self) -> str:
-        """Return the name in the results."""
-
-    @property
-    def path(self) -> str:
-        """Return the path of the recording."""
-
-    @property
-    def error(self) -> str:
-        """Return why it has no result, or ended early; empty if all is well."""
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Return what is doubtful."""
-
-
-Work = TypeVar('Work', bound=Job)
-Row = TypeVar('Row', bound=Result)
-
-
-def recordings_of(options: argparse.Namespace) -> tuple[Found, ...]:
-    """Return the recordings of a command line; raises ParameterError if there is none."""
+    `job` makes one of name, path and folder, `failed` a row of name, path and reason. Raises
+    ParameterError if there is no recording.
+    """
     found = find_recordings(options.recordings, leave_out=options.output)
     if not found:
         raise ParameterError(f'{", ".join(map(str, options.recordings))}: no recording in this '
-                             'folder: give one with .npz, .mat, .wav, .csv, .tdms, .mf4, .uff or '
-                             'rosbag2')
-    return found
-
-
-def run_to_end(run: Callable[[argparse.Namespace, Progress], list[Row]],
-               tell: Callable[[argparse.Namespace, list[Row]], int],
-               options: argparse.Namespace, progress: Progress) -> int:
-    """
-    Run what makes rows, and `tell` what they are; return the exit status.
-
-    It is 2 after one line for what cannot be used or written, 130 for SIGINT and SIGTERM.
-    """
-    use_one_thread()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        require_writable(options.output)
-        rows = run(options, progress)
-    except (SaJitterError, OSError) as error:
-        progress.say(failure(error, options.output))
-        return 2
-    except KeyboardInterrupt:
-        progress.say('stopped; what was finished stays, the same command goes on from there')
-        return 130
-    return tell(options, rows)
+                             f'folder: give one with {FORMATS}')
+    return [job(item.name, os.path.abspath(item.path), str(options.output.absolute() / item.name))
+            for item in found if not item.error], [
+                failed(item.name, str(item.path), item.error) for item in found if item.error]
 
 
 def work_through(function: Callable[[Work], Row], jobs: Sequence[Work], rows: list[Row], *,
@@ -124,7 +73,7 @@ def work_through(function: Callable[[Work], Row], jobs: Sequence[Work], rows: li
         progress.clear()
 
 
-def _say(row: Result, progress: Progress) -> None:
+def _say(row: Any, progress: Progress) -> None:
     for remark in row.remarks:
         progress.say(f'warning: {row.recording}: {remark}')
     if row.error:

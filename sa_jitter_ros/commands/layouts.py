@@ -26,9 +26,9 @@ import xml.etree.ElementTree as ET
 from sa_jitter_ros.averaging.averager_parameters import shaft_parameters
 from sa_jitter_ros.averaging.indicators import INDICATORS
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader
-from sa_jitter_ros.commands.command_line import failure, Parser, require_writable, show
+from sa_jitter_ros.commands.command_line import Parser, run_to_end, show
+from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE as PREDICTOR, read_declaration
-from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.messages import (
     PREDICTION_FIELDS, PredictionMessage, ResidualMessage)
 from sa_jitter_ros.number_text import order_text
@@ -246,8 +246,7 @@ def aggregator(machine: Shown) -> str:
 
 def make_parser() -> Parser:
     """Return the parser of the command line."""
-    parser = Parser(prog='layouts', description=__doc__,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser('layouts', __doc__)
     parser.add_argument('--params', type=Path, required=True, metavar='MACHINE.yaml',
                         help='parameter file of the machine')
     parser.add_argument('--namespace', default='', metavar='NAME', type=_namespace,
@@ -264,20 +263,18 @@ def _namespace(text: str) -> str:
     return text.strip('/')
 
 
+def write(options: argparse.Namespace, progress: Progress) -> None:
+    """Write the files; raises SaJitterError, OSError."""
+    machine = Shown.read(options.params, options.namespace)
+    options.output.mkdir(parents=True, exist_ok=True)
+    for name, make in ((PLOTJUGGLER, plotjuggler), (FOXGLOVE, foxglove), (AGGREGATOR, aggregator)):
+        (options.output / name).write_text(make(machine), 'utf-8')
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Write the files; return the exit status."""
-    options = make_parser().parse_args(args)
-    try:
-        machine = Shown.read(options.params, options.namespace)
-        require_writable(options.output)
-        options.output.mkdir(parents=True, exist_ok=True)
-        for name, make in ((PLOTJUGGLER, plotjuggler), (FOXGLOVE, foxglove),
-                           (AGGREGATOR, aggregator)):
-            (options.output / name).write_text(make(machine), 'utf-8')
-    except (SaJitterError, OSError) as error:
-        print(f'layouts: {failure(error, options.output)}', file=sys.stderr)
-        return 2
-    return show('layouts', f'written: {options.output}')
+    return run_to_end(write, lambda options, _: show('layouts', f'written: {options.output}'),
+                      make_parser().parse_args(args), Progress('layouts'))
 
 
 if __name__ == '__main__':

@@ -12,12 +12,14 @@
 
 import argparse
 from collections import Counter
+from functools import partial
 import os
 from pathlib import Path
 import sys
 
-from sa_jitter_ros.commands.command_line import read_options, show, tacholess_options
-from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
+from sa_jitter_ros.commands.command_line import (
+    plain_warnings, read_options, run_to_end, show, tacholess_options)
+from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.loop import close_loop, Loop
@@ -51,28 +53,37 @@ def _tell_unknown(path: Path, declaration: Declaration) -> None:
               f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
 
 
+def show_report(options: argparse.Namespace, progress: Progress) -> int:
+    """Close the loop on the recordings and write the report; return the exit status."""
+    def write(options: argparse.Namespace, progress: Progress) -> Loop:
+        with plain_warnings('close_loop'), progress.ticking():
+            found = run(options, progress)
+            progress.step('writing the report')
+            found.write(options.output)
+        return found
+
+    return run_to_end(write, lambda options, found: show(
+        'close_loop', found, f'report: {options.output / "report.html"}'), options, progress,
+        stopped='stopped before the report was written')
+
+
 def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
     """Close the loop on each recording, and write their table; raises SaJitterError, OSError."""
     _tell_unknown(options.declared, read_declaration(options.declared, sample_rate=1e9))
-    output, keywords = options.output.absolute(), read_options(options)
-    tacholess = tacholess_options(options)
-    found = recordings_of(options)
-    jobs = [LoopJob(item.name, os.path.abspath(item.path), str(output / item.name),
-                    os.path.abspath(options.declared), keywords, tacholess)
-            for item in found if not item.error]
-    rows = [LoopRow(item.name, str(item.path), item.error) for item in found if item.error]
+    jobs, rows = jobs_of(options, partial(
+        LoopJob, declared=os.path.abspath(options.declared), options=read_options(options),
+        tacholess=tacholess_options(options)), LoopRow)
     try:
         work_through(loop_file, jobs, rows, failed=LoopRow, options=options, progress=progress)
     finally:
         if any(row.verdict for row in rows):
-            write_rows(options.output / LOOPS, sorted(
-                rows, key=lambda row: (row.recording, row.path)))
+            write_rows(options.output / LOOPS, rows)
     return rows
 
 
 def show_fleet(options: argparse.Namespace, progress: Progress) -> int:
     """Close the loop on each recording; return the exit status."""
-    return run_to_end(run_fleet, _tell, options, progress)
+    return run_to_end(run_fleet, _tell, options, progress, stopped=STOPPED)
 
 
 def _tell(options: argparse.Namespace, rows: list[LoopRow]) -> int:

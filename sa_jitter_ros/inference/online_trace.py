@@ -29,7 +29,7 @@ from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.gathering import clock_of
-from sa_jitter_ros.inference.observation import Acquisition, Observation
+from sa_jitter_ros.inference.observation import Acquisition, nameless, NameOf, Observation
 from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench
@@ -67,15 +67,16 @@ class MeasuredNoise(Effect):
 
 
 def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
-                   declared: Sequence[Effect] = (),
+                   declared: Sequence[Effect] = (), name_of: NameOf = nameless,
                    progress: Callable[[str], None] | None = None) -> Trace:
     """
     Trace the residual of averages, those of the longest stretch without a gap.
 
+    `name_of` returns the name of what makes an order.
     Raises ModelError for fewer than 4 of them and SignalError where nothing can be compared.
     """
     stretch = _longest_stretch(averages)
-    observation = _observation(stretch, model)
+    observation = replace(_observation(stretch, model), name_of=name_of)
     require_acquisitions(observation)
     lines = Lines(*np.nonzero(
         good_lines(stretch, places(observation.orders, stretch[0].orders))))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.machine.parts import checked
+from sa_jitter_ros.machine.parts import Part
 from sa_jitter_ros.parameters import Parameter
 
 LEVELS = ('warn', 'alarm')
@@ -22,7 +22,7 @@ _OF = ('order', 'part', 'indicator')
 
 
 @dataclass(frozen=True)
-class Limit:
+class Limit(Part):
     """
     A limit of an order, of what a part of the machine makes, or of a condition indicator.
 
@@ -47,7 +47,7 @@ class Limit:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        checked(place, self, self.KINDS)
+        super().check(place)
         given = [name for name in _OF if getattr(self, name) is not None]
         if len(given) != 1:
             raise ParameterError(f'{place} gives {" and ".join(given) or "no quantity"}: give one '

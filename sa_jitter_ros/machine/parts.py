@@ -15,10 +15,10 @@ Orders of a part are multiples of the speed of a shaft that it is on.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from fractions import Fraction
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import Parameter, require_shaft_names
@@ -33,22 +33,25 @@ _LENGTH = Parameter('length', 0.0, 'a length', unit='m', above=0.0)
 _ORDER = Parameter('order', 0.0, 'a multiple of the speed of the shaft', above=0.0)
 
 
-def checked(place: str, part: Any, kinds: Mapping[str, Parameter]) -> None:
-    """Convert and check the fields of a part; raises ParameterError with the place of it."""
-    for item in fields(part):
-        value, kind = getattr(part, item.name), kinds[item.name]
-        if value is None:
-            continue
-        named = Parameter(f'{place}.{item.name}', kind.default, kind.description, kind.unit,
-                          kind.minimum, kind.maximum, kind.above, kind.choices)
-        value = named.convert(value)
-        if kind is _SHAFT:
-            require_shaft_names(named.name, [value])
-        object.__setattr__(part, item.name, value)
+class Part:
+    """A part of a machine, whose values have the `KINDS` of parameters; None is not given."""
+
+    KINDS: ClassVar[Mapping[str, Parameter]]
+
+    def check(self, place: str) -> None:
+        """Convert and check the values; raises ParameterError with the place in the file."""
+        for name, kind in self.KINDS.items():
+            value, named = getattr(self, name), replace(kind, name=f'{place}.{name}')
+            if value is None:
+                continue
+            value = named.convert(value)
+            if kind is _SHAFT:
+                require_shaft_names(named.name, [value])
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True)
-class GearPair:
+class GearPair(Part):
     """
     Two gears in mesh, with the numbers of their teeth.
 
@@ -66,7 +69,7 @@ class GearPair:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        checked(place, self, self.KINDS)
+        super().check(place)
         if self.shaft == self.mate_shaft:
             raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: gears in '
                                  'mesh are on two shafts')
@@ -107,7 +110,7 @@ class GearPair:
 
 
 @dataclass(frozen=True)
-class Belt:
+class Belt(Part):
     """A belt or chain between two shafts: `ratio` is the speed of the mate's over the shaft's."""
 
     shaft: str
@@ -118,7 +121,7 @@ class Belt:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        checked(place, self, self.KINDS)
+        super().check(place)
         if self.shaft == self.mate_shaft:
             raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: give two')
 
@@ -133,7 +136,7 @@ class Belt:
 
 
 @dataclass(frozen=True)
-class PlanetaryStage:
+class PlanetaryStage(Part):
     """
     A planetary stage, of which one of sun, ring and carrier is fixed.
 
@@ -165,7 +168,7 @@ class PlanetaryStage:
 
     def check(self, place: str) -> None:
         """Check the values, and that the teeth assemble; raises ParameterError."""
-        checked(place, self, self.KINDS)
+        super().check(place)
         if self.input == self.fixed:
             raise ParameterError(f'{place}.input is {self.input}, which is fixed: give another '
                                  'member')
@@ -237,7 +240,7 @@ class PlanetaryStage:
 
 
 @dataclass(frozen=True)
-class Bearing:
+class Bearing(Part):
     """
     A rolling bearing, by its geometry or by the orders that its maker gives.
 
@@ -274,7 +277,7 @@ class Bearing:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        checked(place, self, self.KINDS)
+        super().check(place)
         geometry, given = ([name for name in names if getattr(self, name) is not None]
                            for names in (self.GEOMETRY, self.GIVEN))
         if given and geometry:

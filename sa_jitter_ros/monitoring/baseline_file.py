@@ -31,6 +31,7 @@ import zipfile
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.monitoring.evidence import below
 from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import Layout
 from sa_jitter_ros.parameter_file import require_regular_file
@@ -180,6 +181,5 @@ def _restored(shaft: str, layout: Mapping[str, Any], arrays: Mapping[str, NDArra
         int(layout['channels']), tuple(layout['orders']), tuple(layout['indicators']),
         tuple(layout.get('bearings', ()))),  # older files have none
         settings, share=share)
-    monitor.restore({name.partition('/')[2]: array for name, array in arrays.items()
-                     if name.partition('/')[0] == shaft})
+    monitor.restore(below(arrays, f'{shaft}/'))
     return monitor

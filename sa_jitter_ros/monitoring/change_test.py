@@ -20,6 +20,7 @@ again. A change ends when the scores are again those of the baseline rather than
 change.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -27,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.monitoring.evidence import ChangeEvidence, SIZES, threshold
+from sa_jitter_ros.monitoring.evidence import below, ChangeEvidence, Kept, SIZES, threshold
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 
 FloatArray = NDArray[np.float64]
@@ -90,7 +91,7 @@ def memory_of(values: FloatArray) -> float:
     return min(max(mean, 0.0), _LARGEST_CORRELATION)
 
 
-class ChangeTest:
+class ChangeTest(Kept):
     """
     Baseline by bins of speed and test of quantities (unit, quantity); each unit is one machine.
 
@@ -99,6 +100,9 @@ class ChangeTest:
     `memory` (of each unit, or of all) at least, as far as that is known beforehand. Raises
     ParameterError for `learning` below `LEAST_LEARNED`.
     """
+
+    KEPT = ('active', 'size', 'begun', '_last', '_lagged', '_delayed', '_blocks', '_filled',
+            '_level', '_farthest', '_gone')
 
     def __init__(self, shape: tuple[int, int], *, learning: int,
                  memory: float | FloatArray = 0.0) -> None:
@@ -112,7 +116,7 @@ class ChangeTest:
         self.size: NDArray[np.int64] = np.zeros(shape, np.int64)
         self.begun: FloatArray = np.full((2, len(SIZES), *shape), np.nan)
         self._last: FloatArray = np.full((3, *shape), np.nan)
-        self._products: FloatArray = np.zeros((3, *shape))  # number, lagged, squared
+        self._lagged: FloatArray = np.zeros((3, *shape))  # number, lagged, squared
         self._delayed: FloatArray = np.zeros((_DELAY, 3, *shape))  # and what joins them
         # Of each length: unfinished sum, and number and total of squared sums over the length.
         self._blocks: FloatArray = np.zeros((len(_LENGTHS), 3, *shape))
@@ -123,7 +127,7 @@ class ChangeTest:
 
     def correlation(self) -> FloatArray:
         """Return how successive scores correlate (unit, quantity), `memory` where it is unsure."""
-        count, lagged, squared = self._products
+        count, lagged, squared = self._lagged
         found = lagged / np.where(squared > 0.0, squared, np.inf)
         unsure = found * np.sqrt(np.maximum(count, 1.0)) < _SURE_CORRELATION
         return np.maximum(np.where(unsure, 0.0, np.minimum(found, _LARGEST_CORRELATION)),
@@ -172,7 +176,7 @@ class ChangeTest:
         correlation, last = self.correlation(), self._last
         pair, squared = scores[0] * last[0], 0.5 * (scores[0] ** 2 + last[0] ** 2)
         both = np.isfinite(pair) & ~self.active
-        self._products = self._products + self._delayed[0]
+        self._lagged = self._lagged + self._delayed[0]
         latest = np.where(both, np.stack((np.ones(self.shape), pair, squared)), 0.0)
         self._delayed = np.concatenate((self._delayed[1:], latest[None]))
         self._last = np.where(np.isfinite(scores), scores, last)
@@ -260,28 +264,16 @@ class ChangeTest:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return what `restore` needs: arrays by names."""
-        found = {'active': self.active, 'size': self.size, 'begun': self.begun,
-                 'last': self._last, 'lagged': self._products, 'delayed': self._delayed,
-                 'blocks': self._blocks, 'filled': self._filled,
-                 'level': self._level, 'farthest': self._farthest, 'gone': self._gone,
-                 'bins': np.array(list(self.bins), np.int64)}
-        found.update({f'evidence.{name}': item for name, item in self.evidence.state().items()})
-        for key, place in self.bins.items():
-            found.update({f'bin{key}.{name}': item for name, item in place.state().items()})
+        found = {**super().state(), 'bins': np.array(list(self.bins), np.int64)}
+        for prefix, part in (('evidence', self.evidence), *(
+                (f'bin{key}', place) for key, place in self.bins.items())):
+            found |= {f'{prefix}.{name}': item for name, item in part.state().items()}
         return found
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Go on from a state."""
-        self.active, self.size = state['active'].copy(), state['size'].copy()
-        self.begun, self._last = state['begun'].copy(), state['last'].copy()
-        self._products, self._level = state['lagged'].copy(), state['level'].copy()
-        self._farthest, self._gone = state['farthest'].copy(), state['gone'].copy()
-        self._delayed, self._blocks = state['delayed'].copy(), state['blocks'].copy()
-        self._filled = state['filled'].copy()
-        self.evidence.restore({name.partition('.')[2]: item for name, item in state.items()
-                               if name.startswith('evidence.')})
-        self.bins = {}
-        for key in state['bins'].tolist():
-            place = self.bins[key] = SpeedBin(self.shape)
-            place.restore({name.partition('.')[2]: item for name, item in state.items()
-                           if name.startswith(f'bin{key}.')})
+        super().restore(state)
+        self.evidence.restore(below(state, 'evidence.'))
+        self.bins = {key: SpeedBin(self.shape) for key in state['bins'].tolist()}
+        for key, place in self.bins.items():
+            place.restore(below(state, f'bin{key}.'))

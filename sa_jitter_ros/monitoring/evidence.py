@@ -21,9 +21,10 @@ Ramdas, Rinaldo 2023, "E-detectors"). It is more by the overshoot over A, whose 
 (Siegmund 1985, "Sequential Analysis", Eq. 8.45), so that the rate of false alarms can be stated.
 """
 
+from collections.abc import Mapping
 from functools import lru_cache
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,28 @@ def threshold(scores: float) -> float:
     return scores * overshoot()
 
 
-class ChangeEvidence:
+class Kept:
+    """Arrays that are kept in a file: the attributes in `KEPT`, without underscore."""
+
+    KEPT: ClassVar[tuple[str, ...]] = ()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return what `restore` needs: arrays by names."""
+        return {name.lstrip('_'): getattr(self, name) for name in self.KEPT}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from a state."""
+        for name in self.KEPT:
+            setattr(self, name, state[name.lstrip('_')].copy())
+
+
+def below(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a state whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): item for name, item in state.items()
+            if name.startswith(prefix)}
+
+
+class ChangeEvidence(Kept):
     """
     Evidence of changes of quantities, of one or more units that are judged apart.
 
@@ -72,6 +94,8 @@ class ChangeEvidence:
     of all sizes are the logarithms of the likelihood ratio since the most likely beginning of the
     change; where they are zero none has begun.
     """
+
+    KEPT = ('ratios', 'sums', 'tested')
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.ratios: FloatArray = np.zeros((_TESTED, *shape))
@@ -116,12 +140,3 @@ class ChangeEvidence:
         """Begin again for quantities (unit, quantity)."""
         self.ratios[:, which] = 0.0
         self.sums[:, which] = 0.0
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return what `restore` needs."""
-        return {'ratios': self.ratios, 'sums': self.sums, 'tested': self.tested}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Go on from a state."""
-        self.ratios, self.sums = state['ratios'].copy(), state['sums'].copy()
-        self.tested = state['tested'].copy()

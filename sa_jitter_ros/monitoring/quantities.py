@@ -206,12 +206,22 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
         _readings(table, (values, variance), (amplitude / mean, (error / amplitude) ** 2)))
 
 
-def _readings(table: FloatArray, *others: tuple[FloatArray, FloatArray]) -> FloatArray:
-    """Return the readings of a table, and of others: values and their relative variances."""
+def best_amplitudes(table: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """
+    Return amplitudes (..., order) of a table and their errors, the raw ones without a correction.
+
+    Last comes which are corrected.
+    """
     corrected = np.isfinite(table[..., _FIELD['corrected_amplitude']])
     amplitude, error = (np.where(corrected, table[..., _FIELD[f'corrected_{name}']],
                                  table[..., _FIELD[f'raw_{name}']])
                         for name in ('amplitude', 'standard_error'))
+    return amplitude, error, corrected
+
+
+def _readings(table: FloatArray, *others: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Return the readings of a table, and of others: values and their relative variances."""
+    amplitude, error, corrected = best_amplitudes(table)
     noise = np.fmin(table[..., _FIELD['noise_standard_deviation']], error)
     found = [np.stack((amplitude, noise**2, np.sqrt(np.maximum(error**2 - noise**2, 0.0)),
                        corrected))]

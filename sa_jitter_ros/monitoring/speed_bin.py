@@ -20,11 +20,10 @@ baseline shows is taken out (cube root of Wilson and Hilferty 1931, of a gamma d
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.monitoring.evidence import SIZES
+from sa_jitter_ros.monitoring.evidence import Kept, SIZES
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -104,7 +103,7 @@ def without_skewness(scores: FloatArray, skewness: FloatArray) -> FloatArray:
     return np.where(skewed, 6.0 / used * (cube - 1.0) + used / 6.0, scores)
 
 
-class SpeedBin:
+class SpeedBin(Kept):
     """
     The values of quantities (unit, quantity) in one bin of speed.
 
@@ -113,6 +112,8 @@ class SpeedBin:
     `since` (4, size, unit, quantity) the sums of the weights, of the weighted values and their
     squares since then, and of the squares of the weights.
     """
+
+    KEPT = ('reference', 'recent', 'learned', 'before', 'since')
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.reference: FloatArray = np.full(shape, np.nan)
@@ -220,13 +221,3 @@ class SpeedBin:
         """Return by how much the recent doubt is more than that of the baseline."""
         return np.asarray(np.maximum(
             np.nan_to_num(self.recent[1] - self.baseline().doubt), 0.0))
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return what `restore` needs."""
-        return {'reference': self.reference, 'recent': self.recent, 'learned': self.learned,
-                'before': self.before, 'since': self.since}
-
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
-        """Go on from a state."""
-        for name, values in state.items():
-            setattr(self, name, values.copy())

@@ -205,6 +205,12 @@ class MonitoringNode(Node):
         if bool(reason) != bool(before) and self._is_new(line):
             self._log(Level.WARN if reason else Level.OK, line)
 
+    def set_fault(self, what: str, reason: str) -> None:
+        """Make the status an error that says the reason, until this is ''."""
+        self.faults.pop(what, '')
+        if reason:
+            self.faults[what] = reason
+
     def _log(self, level: Level, line: str) -> None:
         if level == Level.ERROR:  # rclpy wants one line of code for each severity
             self.get_logger().error(line)

@@ -158,9 +158,7 @@ class ChangeMonitor(MonitoringNode):
         """Show an error that lasts until the reason is ''; log it once."""
         if reason and self.faults.get(what) != reason:
             self.get_logger().error(reason)
-        self.faults.pop(what, '')
-        if reason:
-            self.faults[what] = reason
+        self.set_fault(what, reason)
 
     # --- messages ---
 
@@ -209,20 +207,15 @@ class ChangeMonitor(MonitoringNode):
         """Show limits and changes in the status: alarms and severe changes as errors."""
         assert self._monitor is not None
         passed = self._monitor.limits.passed()
-        alarms = [str(item) for item in passed if item.level == LEVELS[-1]]
-        self.faults.pop('limit', '')
-        if alarms:
-            self.faults['limit'] = first_of(alarms)
+        self.set_fault('limit', first_of(
+            [str(item) for item in passed if item.level == LEVELS[-1]]))
         self.set_missing('a limit is passed', first_of(
             [str(item) for item in passed if item.level != LEVELS[-1]]))
         severe: list[str] = []
         others: list[str] = []
         for item in self._monitor.changes():
             (severe if self._is_severe(item) else others).append(str(item))
-        if severe:
-            self.faults['change'] = first_of(severe)
-        else:
-            self.faults.pop('change', '')
+        self.set_fault('change', first_of(severe))
         self.set_missing('the machine has changed', first_of(others))
 
     def _is_severe(self, item: Change) -> bool:

@@ -22,9 +22,9 @@ from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.live_view_board import (
-    amplitude_rows, Attenuations, Board, CHANNELS, INDICATORS, indicators_content, OrderMap,
-    ORDERS, orders_content, PulseErrors, pulses_content, spectrum_content, SPEEDS, table_content,
-    Trend, waveform_content)
+    amplitude_rows, Board, CHANNELS, HISTORY, History, HISTORY_NUMBERS, INDICATORS,
+    indicators_content, OrderMap, ORDERS, orders_content, PulseErrors, pulses_content,
+    spectrum_content, SPEEDS, table_content, Trend, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, decode_residual, PREDICTION_FIELDS,
@@ -55,7 +55,8 @@ class ShaftView:
 
     def __init__(self, shaft: str, board: Board) -> None:
         self._shaft, self._board = shaft, board
-        self._errors, self._attenuations, self._indicators = PulseErrors(), Attenuations(), Trend()
+        self._errors, self._indicators = PulseErrors(), Trend()
+        self._attenuations = History(HISTORY_NUMBERS, HISTORY)
         self._amplitudes = {'raw': Trend(), 'corrected': Trend()}
         self._maps = {'synchronous_average': OrderMap(), 'corrected_average': OrderMap()}
 
@@ -96,7 +97,8 @@ class ShaftView:
         """Show order amplitudes and their trend; return the message."""
         average = decode_average('order_amplitude', message)
         shown = average.values[:CHANNELS, :ORDERS]
-        history = self._attenuations.add(shown[..., 0], shown[..., 5])
+        history = self._attenuations.add(
+            average.header.end_time, shown[..., 0].tobytes(), shown[..., 5])
         self._put('order_amplitude', partial(orders_content, average, history))
         for kind, trend in self._amplitudes.items() if len(shown) else ():
             self._put(f'{kind}_trend', trend.add(

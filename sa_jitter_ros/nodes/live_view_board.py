@@ -119,34 +119,33 @@ class PulseErrors:
         return self.values
 
 
-class Attenuations:
-    """The attenuations (channel, order) of the latest averages of one shaft."""
+class History:
+    """
+    Arrays of the latest averages of one shaft, `most`, fewer where they hold more `numbers`.
 
-    def __init__(self) -> None:
-        self._orders: FloatArray = np.empty(0)
-        self._values: deque[FloatArray] = deque()
+    Another `key`, and times that run back, start a new one.
+    """
 
-    def add(self, orders: FloatArray, values: FloatArray) -> list[FloatArray]:
-        """Add those of an average; other orders or channels start a new list. Return all."""
-        if not np.array_equal(orders, self._orders, equal_nan=True):
-            self._orders = orders
-            self._values = deque(
-                maxlen=int(np.clip(HISTORY_NUMBERS // max(values.size, 1), 1, HISTORY)))
-        self._values.append(values)
-        return list(self._values)
+    def __init__(self, numbers: int, most: int) -> None:
+        self._numbers, self._most, self._key = numbers, most, None
+        self.rows: deque[tuple[Any, ...]] = deque()
+
+    def add(self, time: float, key: Any, *arrays: NDArray[Any]) -> list[tuple[Any, ...]]:
+        """Add the arrays of an average that ended at `time` (s); return all, with their times."""
+        if key != self._key or (self.rows and time < self.rows[-1][0]):
+            size = max(sum(array.size for array in arrays), 1)
+            self._key = key
+            self.rows = deque(maxlen=int(np.clip(self._numbers // size, 1, self._most)))
+        self.rows.append((time, *arrays))
+        return list(self.rows)
 
 
 class Trend:
-    """
-    What the latest averages of one shaft found: rows (channel, name) with standard errors.
-
-    Other names or channels, and times that run back, start a new trend.
-    """
+    """What the latest averages of one shaft found: rows (channel, name) with standard errors."""
 
     def __init__(self) -> None:
+        self._history = History(TREND_NUMBERS, TREND_AVERAGES)
         self._names: tuple[str, ...] = ()
-        self._shape: tuple[int, ...] = ()
-        self._rows: deque[tuple[float, FloatArray, FloatArray]] = deque()
 
     def add(self, time: float, names: tuple[str, ...], values: FloatArray, errors: FloatArray
             ) -> Callable[[int], Json]:
@@ -155,13 +154,9 @@ class Trend:
 
         Returns the content by channel.
         """
-        back = bool(self._rows) and time < self._rows[-1][0]
-        if back or (names, values.shape) != (self._names, self._shape):
-            self._names, self._shape = names, values.shape
-            self._rows = deque(maxlen=int(np.clip(
-                TREND_NUMBERS // max(2 * values.size, 1), 1, TREND_AVERAGES)))
-        self._rows.append((time, values, errors))
-        return self._content()
+        self._names = names
+        rows = self._history.add(time, (names, values.shape), values, errors)
+        return lambda channel: trend_content(names, rows, channel)
 
     def amend(self, time: float, errors: FloatArray) -> Callable[[int], Json] | None:
         """
@@ -169,28 +164,23 @@ class Trend:
 
         Returns the content by channel, None where the errors are those of another average.
         """
-        if not self._rows or self._rows[-1][0] != time or errors.shape != self._shape:
+        last, values, _ = self._history.rows[-1] if self._history.rows else (math.nan, errors, 0)
+        if last != time or errors.shape != values.shape:
             return None
-        self._rows[-1] = (time, self._rows[-1][1], errors)
-        return self._content()
-
-    def _content(self) -> Callable[[int], Json]:
-        names, rows = self._names, list(self._rows)  # a thread may be sending as the next comes
-        return lambda channel: trend_content(names, rows, channel)
+        self._history.rows.pop()
+        return self.add(time, self._names, values, errors)
 
 
 class OrderMap:
     """The order spectra of the latest averages of one shaft, for a picture."""
 
     def __init__(self) -> None:
-        self._rows: deque[tuple[float, NDArray[np.float32]]] = deque()
+        self._history = History(MAP_NUMBERS, MAP_AVERAGES)
         self._next = -math.inf  # s, when the next row may be added
 
     def add(self, end_time: float, waveforms: FloatArray) -> Callable[[int], Json] | None:
         """
         Add an average (channel, angle) that ended at a time (s).
-
-        Others of another shape, and times that run back, start a new map.
 
         Returns the content by channel, None where the last row is too young for another.
         """
@@ -199,16 +189,11 @@ class OrderMap:
             return None
         self._next = now + MAP_PERIOD
         amplitudes = spectrum(waveforms)[0].astype(np.float32)
-        if not self._rows or self._rows[-1][1].shape != amplitudes.shape or (
-                end_time < self._rows[-1][0]):
-            self._rows = deque(maxlen=int(np.clip(
-                MAP_NUMBERS // max(amplitudes.size, 1), 1, MAP_AVERAGES)))
-        self._rows.append((end_time, amplitudes))
-        rows = list(self._rows)
+        rows = self._history.add(end_time, amplitudes.shape, amplitudes)
         return lambda channel: map_content(rows, channel)
 
 
-def map_content(rows: list[tuple[float, NDArray[np.float32]]], channel: int) -> Json:
+def map_content(rows: list[tuple[Any, ...]], channel: int) -> Json:
     """
     Return the map of one channel: the latest average last, a character for each amplitude.
 
@@ -231,8 +216,7 @@ def map_content(rows: list[tuple[float, NDArray[np.float32]]], channel: int) -> 
             'step': step, 'pool': pool, 'peak': json_values(peak), 'span': MAP_SPAN}
 
 
-def trend_content(names: tuple[str, ...], rows: list[tuple[float, FloatArray, FloatArray]],
-                  channel: int) -> Json:
+def trend_content(names: tuple[str, ...], rows: list[tuple[Any, ...]], channel: int) -> Json:
     """Return a trend of one channel: names, times, values and errors (average, name)."""
     step = -(-2 * len(names) * len(rows) // TREND_SENT)
     shown = rows[::-1][::step][::-1] if channel < len(rows[0][1]) else []
@@ -324,11 +308,11 @@ def indicators_content(average: AverageMessage) -> Json:
             'values': json_values(values)}
 
 
-def orders_content(average: AverageMessage, history: list[FloatArray]) -> Json:
+def orders_content(average: AverageMessage, history: list[tuple[Any, ...]]) -> Json:
     """Return order amplitudes: fields (channel, order), attenuations of earlier averages."""
     shown = average.values[:CHANNELS, :ORDERS]
     return {'header': header_content(average.header),
-            'history': [json_values(item) for item in history],
+            'history': [json_values(item) for _, item in history],
             **{name: json_values(shown[..., i]) for i, name in enumerate(average.names)}}
 
 

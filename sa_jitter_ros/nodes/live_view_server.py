@@ -76,71 +76,65 @@ def is_name_of_this_machine(header: str) -> bool:
     return True
 
 
-class PageServer:
+class PageServer(ThreadingHTTPServer):
     """
     Serves the page and the JSON object `snapshot(since, channel)` from a separate thread.
 
-    It listens on `host` and the first free port from `port` on (0: any). Raises `ParameterError`
-    where this is not possible. `requests` and `refused` are counts.
+    It listens on `host` and the first free `port` from the one given on (0: any). Raises
+    `ParameterError` where this is not possible. `requests` counts answered requests, `refused`
+    those that were no GET, had a foreign host name, or were too many at once.
     """
+
+    daemon_threads = True
 
     def __init__(self, snapshot: Callable[[int, int], dict[str, Any]], *, host: str, port: int
                  ) -> None:
         folder = files('sa_jitter_ros.nodes').joinpath('live_view_page')
-        pages = {f'/{item.name}': item.read_bytes() for item in folder.iterdir()
-                 if item.name.rpartition('.')[2] in KINDS}
-        pages['/'] = pages['/index.html']
-        self._server = _listen(host, port)
-        self._server.pages, self._server.snapshot = pages, snapshot
-        self.port = int(self._server.server_address[1])
-        name = socket.gethostname() if host in ('0.0.0.0', '::') else host
-        self.address = f'http://{f"[{name}]" if ":" in name else name}:{self.port}/'
-        self._thread = Thread(target=self._server.serve_forever, kwargs={'poll_interval': 0.05},
-                              name='live_view', daemon=True)
-        self._thread.start()
-
-    @property
-    def requests(self) -> int:
-        """Return the number of answered requests."""
-        return self._server.requests
-
-    @property
-    def refused(self) -> int:
-        """Return the number of refused requests: no GET, a foreign host name, too many at once."""
-        return self._server.refused
-
-    def close(self) -> None:
-        """Stop the server."""
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
-
-
-def _listen(host: str, port: int) -> '_Server':
-    last = min(port + PORTS_TRIED, 65536) if port else 1
-    for candidate in range(port, last):
-        try:
-            return _Server(host, candidate)
-        except OSError as error:
-            if error.errno != EADDRINUSE:
-                raise ParameterError(f'cannot listen on {host} port {candidate}: '
-                                     f'{error.strerror or error}') from None
-    raise ParameterError(f'ports {port} to {last - 1} of {host} are in use: set another port, or '
-                         '0 for any free port')
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    pages: dict[str, bytes]
-    snapshot: Callable[[int, int], dict[str, Any]]
-
-    def __init__(self, host: str, port: int) -> None:
-        self.address_family = socket.AF_INET6 if ':' in host else socket.AF_INET
-        super().__init__((host, port), _Handler)
+        self.pages = {f'/{item.name}': item.read_bytes() for item in folder.iterdir()
+                      if item.name.rpartition('.')[2] in KINDS}
+        self.pages['/'] = self.pages['/index.html']
+        self.snapshot = snapshot
         self.requests = self.refused = 0
         self._free = BoundedSemaphore(CONNECTIONS)
         self._deadlines: dict[socket.socket, float] = {}
         self._asking: dict[socket.socket, None] = {}  # those whose request has not arrived yet
+        self.address_family = socket.AF_INET6 if ':' in host else socket.AF_INET
+        super().__init__((host, port), _Handler, bind_and_activate=False)
+        try:
+            self._listen(host, port)
+        except ParameterError:
+            self.server_close()
+            raise
+        self.port = int(self.server_address[1])
+        name = socket.gethostname() if host in ('0.0.0.0', '::') else host
+        self.address = f'http://{f"[{name}]" if ":" in name else name}:{self.port}/'
+        self._thread = Thread(target=self.serve_forever, kwargs={'poll_interval': 0.05},
+                              name='live_view', daemon=True)
+        self._thread.start()
+
+    def _listen(self, host: str, port: int) -> None:
+        last = min(port + PORTS_TRIED, 65536) if port else 1
+        for candidate in range(port, last):
+            self.socket.close()  # one that was bound, but cannot listen, cannot be bound again
+            self.socket = socket.socket(self.address_family, self.socket_type)
+            self.server_address = (host, candidate)
+            try:
+                self.server_bind()
+                self.server_activate()
+            except OSError as error:
+                if error.errno != EADDRINUSE:
+                    raise ParameterError(f'cannot listen on {host} port {candidate}: '
+                                         f'{error.strerror or error}') from None
+            else:
+                return
+        raise ParameterError(f'ports {port} to {last - 1} of {host} are in use: set another port, '
+                             'or 0 for any free port')
+
+    def close(self) -> None:
+        """Stop the server."""
+        self.shutdown()
+        self.server_close()
+        self._thread.join()
 
     def server_bind(self) -> None:
         """Bind without a query to a name server."""
@@ -199,7 +193,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: _Server
+    server: PageServer
     timeout = ANSWER_SECONDS
     server_version, sys_version = 'live_view', ''
 

@@ -150,7 +150,7 @@ class PlaybackNode(MonitoringNode):
         """Apply changed values."""
         if values['playing'] and not self._playing and self._stream is None:
             self._stream = self.portions()  # the stream has ended: play it again
-            self.faults.pop('stream', None)
+            self.set_fault('stream', '')
         self._playing = values['playing']
         self._timer.timer_period_ns = round(self._period(values['rate']) * 1e9)
         self._pacer.run(time.monotonic(), rate=values['rate'],
@@ -174,7 +174,7 @@ class PlaybackNode(MonitoringNode):
                 if self._sent >= due or not self._send_next():
                     break
         except SaJitterError as error:
-            self.faults['stream'] = f'ended early: {error}'
+            self.set_fault('stream', f'ended early: {error}')
             self.get_logger().error(self.faults['stream'])
             self._end()
             return

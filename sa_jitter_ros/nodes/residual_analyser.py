@@ -10,13 +10,13 @@
 
 """Node `residual_analyser`: compares measured with predicted attenuation and finds its cause."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 import json
 import threading
 import time
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,10 @@ from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
 from std_msgs.msg import Float64MultiArray, String
+
+Found = TypeVar('Found')
+#: What is found after some calls of the timer.
+Waiting = Generator[None, None, Found]
 
 PARAMETERS = (
     Parameter('shaft', 'shaft', 'shaft whose averages are compared', read_only=True),
@@ -74,7 +78,6 @@ class ResidualAnalyser(MonitoringNode):
         self._pulses: dict[float, NDArray[np.float64]] = {}
         self._prediction: Published | None = None
         self._significant = self._waited = False
-        self._step: Callable[[], None] = self._compare
         self._added: set[str] = set()  # names of the effects that were set in the predictor
         self._verdict = self._activity = ''
         self._batches = self._uncorrected = self._interrupted = 0
@@ -94,7 +97,8 @@ class ResidualAnalyser(MonitoringNode):
         self._flows = ResultFlows(self, [shaft], ['pulse_error'])
         self._prediction_flow = self.watch_input(
             'prediction', 'prediction', 'see the status of the predictor', once=True)
-        self.create_steady_timer(_PERIOD, lambda: self._step())
+        steps = self._loop()
+        self.create_steady_timer(_PERIOD, lambda: next(steps))
         self.parameters.watch(check=lambda values: None, apply=self._apply)
         self.get_logger().info(f'started: compares {self._values["acquisitions"]} averages of '
                                f'{shaft} at once with {self._predictor_name}')
@@ -158,26 +162,38 @@ class ResidualAnalyser(MonitoringNode):
             received.keyphasor_rate, received.trigger_cycles, received.ratio,
             received.pulse_error_standard_deviation)
 
-    # --- the loop: the timer calls `_step`, the next step to try ---
+    # --- the loop: at each `yield` it waits for the next call of the timer ---
 
-    def _compare(self) -> None:
-        """Compare a full batch with the prediction, then ask the predictor for its parameters."""
-        self._activity = ''
+    def _loop(self) -> Waiting[None]:
+        """Compare each full batch with the prediction, and search the cause of the residual."""
+        while True:
+            self._activity = ''
+            yield
+            averages = self._compare()
+            if averages and self._prediction is not None:
+                try:
+                    model, effects = yield from self._declared(averages, self._prediction)
+                    yield from self._trace(averages, model, effects)
+                except SaJitterError as error:
+                    self.warn(f'{self._predictor_name}: {error}')
+
+    def _compare(self) -> list[ReceivedAverage]:
+        """Publish the residual of a full batch, and return its averages; [] without one."""
         if not self._batch.full or self._prediction is None:
-            return
+            return []
         pulses = [self._pulses.get(item.start_time) for item in self._batch.averages]
         averages = [replace(item, pulses=values if _resolved(values) else None)
                     for item, values in zip(self._batch.averages, pulses)]
         if pulses[-1] is None and not self._waited:
             self._waited = True  # the pulse errors of an average are published after it
-            return
+            return []
         self._waited = False
         try:
             require_comparable(averages, self._prediction)
             table, found = compare(averages, self._prediction)
         except SaJitterError as error:
             self.set_missing('residual', str(error))
-            return
+            return []
         self.set_missing('residual', '')
         ambiguous = sum(values is not None and not _resolved(values) for values in pulses)
         self.set_missing('cause', '' if len(averages) - ambiguous >= _FEWEST else (
@@ -189,38 +205,30 @@ class ResidualAnalyser(MonitoringNode):
         self._significant = found.p_value < _SIGNIFICANT
         self._residual.publish(encode_residual(ResidualMessage(
             table, len(averages), found.chi2_per_dof, found.p_value, found.rms)))
-        self._ask(averages, self._prediction)
+        return averages
 
-    def _ask(self, averages: Sequence[ReceivedAverage], prediction: Published) -> None:
-        """Trace with the predictor's declared model, or with one made of its prediction."""
-        def without() -> None:
-            self.set_missing('declared model', f'{self._predictor_name} does not answer: '
-                             'independent jitter without effects is assumed; start the node, or '
-                             'set the parameter predictor to its name')
-            self._trace(averages, lambda: trace_averages(
-                averages, declared_by(averages, prediction)))
-
-        def ask(parameters: Sequence[Parameter], *others: Sequence[Parameter]) -> None:
-            def answered(response: Any) -> None:
-                unset = ParameterType.PARAMETER_NOT_SET in {item.type for item in response.values}
-                if unset or len(response.values) < len(parameters):
-                    if others:
-                        ask(*others)
-                    else:
-                        without()  # the node is no predictor
-                    return
-                model, effects = self._declared(parameters, response)
-                self.set_missing('declared model', '')
-                self._trace(averages, lambda: trace_averages(
-                    averages, model, declared=effects))
-            names = [item.name for item in parameters]
-            self._request(lambda: self._predictor.get_parameters(names), answered, without)
-
+    def _declared(self, averages: Sequence[ReceivedAverage], prediction: Published
+                  ) -> Waiting[tuple[DeclaredModel, tuple[Effect, ...]]]:
+        """Ask for the predictor's declared model and effects; else make one of its prediction."""
         shaft = self._values['shaft']
-        ask(predictor_parameters(), predictor_parameters([shaft], [f'{shaft}.ratio']))
+        for parameters in (predictor_parameters(),
+                           predictor_parameters([shaft], [f'{shaft}.ratio'])):
+            response = yield from self._answer(partial(
+                self._predictor.get_parameters, [item.name for item in parameters]))
+            if response is None:
+                break
+            unset = ParameterType.PARAMETER_NOT_SET in {item.type for item in response.values}
+            if not unset and len(response.values) >= len(parameters):
+                found = self._declaration(parameters, response)
+                self.set_missing('declared model', '')
+                return found
+        self.set_missing('declared model', f'{self._predictor_name} does not answer: independent '
+                         'jitter without effects is assumed; start the node, or set the '
+                         'parameter predictor to its name')
+        return declared_by(averages, prediction), ()
 
-    def _declared(self, parameters: Sequence[Parameter], response: Any
-                  ) -> tuple[DeclaredModel, tuple[Effect, ...]]:
+    def _declaration(self, parameters: Sequence[Parameter], response: Any
+                     ) -> tuple[DeclaredModel, tuple[Effect, ...]]:
         """Return the predictor's model and its effects, except those that were set here."""
         values: Values = {}
         for item, value in zip(parameters, response.values):
@@ -232,35 +240,30 @@ class ResidualAnalyser(MonitoringNode):
         declaration = declaration_of(values)
         return declaration.model, declaration.effects
 
-    def _trace(self, averages: Sequence[ReceivedAverage], work: Callable[[], Trace]) -> None:
-        """Trace averages in a thread, so that the executor is not blocked."""
-        job = _Job(work)
+    def _trace(self, averages: Sequence[ReceivedAverage], model: DeclaredModel,
+               effects: Sequence[Effect]) -> Waiting[None]:
+        """Trace in a thread, that the executor goes on; with `close_loop`, set what it finds."""
+        name_of = partial(self.parameters.machine.name_of, self._values['shaft'])
+        job = _Job(partial(trace_averages, averages, model, declared=effects, name_of=name_of))
         self._activity = 'tracing'
-
-        def look() -> None:
-            if job.thread.is_alive():
-                return
-            self._step = self._compare
-            if job.result is not None:
-                self._publish_trace(job.result, len(averages))
-            else:
-                self._untraced += len(averages)
-                self.warn(f'the cause of the residual could not be searched: {job.error}')
-        self._step = look
-
-    def _publish_trace(self, trace: Trace, averages: int) -> None:
-        """Publish the trace of `averages`; with `close_loop`, set its effects in the predictor."""
+        while job.thread.is_alive():
+            yield
+        trace = job.result
+        if trace is None:
+            self._untraced += len(averages)
+            self.warn(f'the cause of the residual could not be searched: {job.error}')
+            return
         content = report(trace)
-        self._untraced += averages - sum(content['acquisitions'].values())
+        self._untraced += len(averages) - sum(content['acquisitions'].values())
         self._verdict = content['verdict']
         self._missing_effect.publish(String(data=json.dumps(content, allow_nan=False)))
         found = {item.name: item.effect.values for item in (*trace.findings, *trace.refinements)
                  if item.effect is not None}
         changed = (found or self._added) if self._significant else (found and not self._added)
         if self._values['close_loop'] and changed:
-            self._set_effects(found)
+            yield from self._set_effects(found)
 
-    def _set_effects(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+    def _set_effects(self, found: Mapping[str, Mapping[str, Any]]) -> Waiting[None]:
         """Set the predictor's effects and wait for the prediction with them."""
         wanted: dict[str, Any] = {
             f'effects.{name}.enabled': False for name in self._added - found.keys()}
@@ -269,52 +272,37 @@ class ResidualAnalyser(MonitoringNode):
             wanted.update({f'effects.{name}.{key}': list(value) if isinstance(value, tuple)
                            else value for key, value in parameters.items()})
         before = self._prediction
-
-        def wait() -> None:
+        response = yield from self._answer(partial(
+            self._predictor.set_parameters_atomically,
+            [as_ros_parameter(name, value) for name, value in wanted.items()]))
+        refused = ''
+        if response is None:
+            refused = ('does not answer: its effects cannot be set; start the node, or set the '
+                       'parameter predictor to its name')
+        elif not response.result.successful:
+            refused = f'refuses the effects: {response.result.reason}'
+        self.set_missing('closed loop', refused and f'{self._predictor_name} {refused}')
+        if not refused:
+            self._added = set(found)
             self._activity = 'waiting for the prediction with the effects'
-            if self._prediction is not before:
-                self._step = self._compare
+            while self._prediction is before:
+                yield
 
-        def answered(response: Any) -> None:
-            if response.result.successful:
-                self._added, self._step = set(found), wait
-                self.set_missing('closed loop', '')
-            else:
-                self.set_missing('closed loop', f'{self._predictor_name} refuses the effects: '
-                                 f'{response.result.reason}')
-                self._step = self._compare
-
-        def without() -> None:
-            self.set_missing('closed loop', f'{self._predictor_name} does not answer: its effects '
-                             'cannot be set; start the node, or set the parameter predictor to '
-                             'its name')
-            self._step = self._compare
-        changes = [as_ros_parameter(name, value) for name, value in wanted.items()]
-        self._request(lambda: self._predictor.set_parameters_atomically(changes),
-                      answered, without)
-
-    def _request(self, call: Callable[[], Future], answered: Callable[[Any], None],
-                 without: Callable[[], None]) -> None:
-        """Call a service of the predictor, then `answered`, or `without` after a timeout."""
-        end = time.monotonic() + _FIND_TIMEOUT
-        future: Future | None = None
+    def _answer(self, call: Callable[[], Future]) -> Waiting[Any]:
+        """Call a service of the predictor; return its response, None after a timeout."""
         self._activity = f'waiting for {self._predictor_name}'
-
-        def look() -> None:
-            nonlocal future, end
-            if future is None and self._predictor.services_are_ready():
-                future, end = call(), time.monotonic() + _ANSWER_TIMEOUT
-            elif future is not None and future.done():
-                try:
-                    answered(future.result())
-                except SaJitterError as error:
-                    self.warn(f'{self._predictor_name}: {error}')
-                    self._step = self._compare
-            elif time.monotonic() > end:
-                if future is not None:
-                    future.cancel()
-                without()
-        self._step = look
+        end = time.monotonic() + _FIND_TIMEOUT
+        while not self._predictor.services_are_ready():
+            if time.monotonic() > end:
+                return None
+            yield
+        future, end = call(), time.monotonic() + _ANSWER_TIMEOUT
+        while not future.done():
+            if time.monotonic() > end:
+                future.cancel()
+                return None
+            yield
+        return future.result()
 
     # --- diagnostics ---
 

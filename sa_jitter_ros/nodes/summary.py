@@ -22,6 +22,7 @@ from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.monitoring.limits import PassedLimit
+from sa_jitter_ros.monitoring.quantities import best_amplitudes
 from sa_jitter_ros.number_text import HALF_95, measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
@@ -67,9 +68,7 @@ def _orders(table: FloatArray, unit: str, name_of: Callable[[float], str]
             ) -> Iterator[tuple[str, str]]:
     """Iterate over the strongest orders of a table (order, field), or names, and their texts."""
     field = dict(zip(AMPLITUDE_FIELDS, table.T))
-    corrected = np.isfinite(field['corrected_amplitude'])
-    amplitude, error = (np.where(corrected, field[f'corrected_{name}'], field[f'raw_{name}'])
-                        for name in ('amplitude', 'standard_error'))
+    amplitude, error, _ = best_amplitudes(table)
     known = np.flatnonzero(np.isfinite(amplitude))
     for place in sorted(known[np.argsort(-amplitude[known])][:_ORDERS]):
         order = field['order'][place]

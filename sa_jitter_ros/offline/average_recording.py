@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
 from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
-from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
@@ -29,7 +28,8 @@ from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, read_about, Signals, stamp, write_averages)
+    finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, stamp,
+    write_averages)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -37,7 +37,8 @@ from sa_jitter_ros.pulses.detection import spikes_text
 from sa_jitter_ros.pulses.detector_parameters import detector_of
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
-from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
+from sa_jitter_ros.recordings.channel_check import (
+    channel_faults, fault_texts, is_lost, without_channels)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
 from sa_jitter_ros.tacholess.recording import Tacholess
@@ -53,18 +54,15 @@ _MOST_REMARKS = 10
 
 
 @dataclass(frozen=True)
-class AverageJob:
+class AverageJob(RecordingJob):
     """
-    One recording to average: its `name` in the results, its `path` and the folder of its files.
+    One recording to average.
 
     `options` are keywords of `read`; `fields` among them are those that the user gave. The channel
     `state`, a name or a number, may be constant. With `tacholess` the pulses are found in the
     vibration.
     """
 
-    name: str
-    path: str
-    folder: str
     machine: MachineFile
     options: Mapping[str, Any] = field(default_factory=dict)
     fields: tuple[str, ...] = ()
@@ -74,7 +72,7 @@ class AverageJob:
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(RecordingRow):
     """
     What became of one recording.
 
@@ -83,9 +81,6 @@ class Row:
     `trigger_speed` (Hz) is the mean of the averages.
     """
 
-    recording: str
-    path: str
-    error: str = ''
     averages: int = 0
     trigger_speed: float = math.nan
     trigger_cycles: int = 0
@@ -103,27 +98,18 @@ class RecordingAverager:
     def __init__(self, recording: Recording, values: Values, detector: Values,
                  limits: LimitWatch, found: FoundPulses | None = None) -> None:
         self._recording, self._values, self._found = recording, values, found
-        self._stream = streaming_averager(values, buffer_seconds=math.inf)
+        #: The averager, for its counts, and the times (s) of all pulses of the keyphasor.
+        self.stream = streaming_averager(values, buffer_seconds=math.inf)
         self._results = {name: ShaftResults(gear_settings(values, name))
                          for name in values['shafts']}
         waveform = detector_of(detector)
-        self._pulses = recording.keyphasor_pulses(detector=waveform)
+        self.pulses = recording.keyphasor_pulses(detector=waveform)
         self._spikes = spikes_text(waveform.state.spikes)
         self.limits = limits
         #: What was said of limits that the averages passed.
         self.passed: list[str] = []
         self.refused = 0
         self.ended_early = ''
-
-    @property
-    def stream(self) -> StreamingAverager:
-        """Return the averager, for its counts."""
-        return self._stream
-
-    @property
-    def pulses(self) -> FloatArray:
-        """Return the times (pulse,) in s of all pulses of the keyphasor."""
-        return self._pulses
 
     def results(self, progress: Progress | None = None
                 ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
@@ -132,12 +118,12 @@ class RecordingAverager:
 
         A recording that breaks off in the middle ends there: `ended_early` says why.
         """
-        recording, stream = self._recording, self._stream
+        recording, stream = self._recording, self.stream
         rate, start, index = recording.sample_rate, recording.start_time, 0
-        yield from self._arrays(stream.add_pulses(self._pulses))
+        yield from self._arrays(stream.add_pulses(self.pulses))
         # Vibration that no pulse follows would only wait.
-        end = self._pulses[-1] + max(np.diff(self._pulses[-3:]), default=0.0) + 1.0 \
-            if self._pulses.size else start
+        end = self.pulses[-1] + max(np.diff(self.pulses[-3:]), default=0.0) + 1.0 \
+            if self.pulses.size else start
         blocks = recording.blocks(max(_BLOCK // recording.channels, 1))
         while True:
             try:
@@ -156,12 +142,12 @@ class RecordingAverager:
 
     def none(self) -> SignalError:
         """Return the error for a recording without an average."""
-        recording, pulses = self._recording, self._pulses
+        recording, pulses = self._recording, self.pulses
         start, end = recording.start_time, recording.start_time + recording.duration
-        messages = self._stream.take_messages()
+        messages = self.stream.take_messages()
         return SignalError(
             f'{pulses.size} pulses and vibration from {start:g} s to {end:g} s make '
-            f'{self._stream.counts.cycles} whole trigger cycles of the '
+            f'{self.stream.counts.cycles} whole trigger cycles of the '
             f'{self._values["trigger_cycles"]} of an average: '
             + (self.ended_early or likely_mistake(pulses, start, end, recording.sample_rate)
                or '; '.join(messages[:2]) or 'lower trigger_cycles, or give more pulses'))
@@ -172,14 +158,14 @@ class RecordingAverager:
         target = {name: self._values[name] for name in (
             'pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth')}
         found = list(doubts(
-            self._recording, self._pulses, **target,
+            self._recording, self.pulses, **target,
             jitter_std=1.0 / math.sqrt(12.0) / rate
             if rate and self._recording.tach is None else None))
         weak = []  # a shaft of which the vibration shows nothing is no mistake beside others
         for item in series:
-            settings = self._stream.shafts[item.shaft].settings
+            settings = self.stream.shafts[item.shaft].settings
             weak.append(weak_orders(
-                self._recording, self._pulses, item.orders.tolist(),
+                self._recording, self.pulses, item.orders.tolist(),
                 ratio=settings.cycle_length / settings.revolutions_per_trigger, **target))
         return (*filter(None, [self._spikes]), *found, *(weak[0] if all(weak) else ()))
 
@@ -189,7 +175,7 @@ class RecordingAverager:
             self.refused += average.correction is not None and not average.correction.accepted
             results = self._results[name].of(average)
             if self._found is not None:
-                settings = self._stream.shafts[name].settings
+                settings = self.stream.shafts[name].settings
                 results['order_amplitude'] = _with_found(
                     results['order_amplitude'], self._found.correct(average, ratio=(
                         settings.cycle_length / settings.revolutions_per_trigger)))
@@ -226,15 +212,10 @@ def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
         settings = _settings(job)
         done = read_about(Path(job.folder))
         if done is not None and done.get('settings') == settings:
-            return _row(done['row'])
+            return Row(**row_values(done['row']))
         return _averaged(job, settings, progress)
     except SaJitterError as error:
         return Row(job.name, job.path, error=str(error))
-
-
-def _row(values: Mapping[str, Any]) -> Row:
-    """Return the row of a folder that was finished before."""
-    return Row(**{**values, 'remarks': tuple(values['remarks'])})
 
 
 def _settings(job: AverageJob) -> dict[str, Any]:
@@ -256,11 +237,7 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     several = '' if recording.acquisitions == 1 else (
         f'the file holds {recording.acquisitions} acquisitions, of which one is averaged: '
         '--acquisition chooses another')
-    remarks = [*filter(None, [several]), *recording.remarks, *(
-        f'{recording.channel_names[channel]} {reason}'
-        + (' and is left out: check its sensor and cable' if channel in lost else
-           ': lower its gain, or choose a larger range')
-        for channel, reason in faults.items())]
+    remarks = [*filter(None, [several]), *recording.remarks, *fault_texts(recording, faults)]
     recording = without_channels(recording, lost)
     found = None
     if job.tacholess is not None:

@@ -78,28 +78,21 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Event:
-    """What changed, or is back at its baseline, with which recording this was `found`."""
-
-    found: str
-    text: str
-
-
-@dataclass(frozen=True)
 class Changes:
     """
     What the monitors of the shafts found in `recordings`, in order of time.
 
     Those of `baseline`, the first ones of each bin of the state, are learnt. `left_out` are
     reasons by the names of recordings; `found` are those with which the present `changes` were
-    found, `limits` the machine's.
+    found, `limits` the machine's. `events` say with which recording something changed, or was back
+    at its baseline.
     """
 
     baseline: tuple[bool, ...]
     recordings: tuple[Recorded, ...]
     left_out: Mapping[str, str]
     monitors: Mapping[str, ShaftMonitor]
-    events: tuple[Event, ...]
+    events: tuple[dict[str, str], ...]
     found: Mapping[Key, str]
     limits: LimitWatch
 
@@ -126,7 +119,7 @@ class Changes:
             'changes': [*(self._content(item, self.since(item)) for item in self.limits.passed()),
                         *(self._content(item, self.found[key_of(item)])
                           for item in self.changes)],
-            'events': [{'recording': item.found, 'text': item.text} for item in self.events],
+            'events': list(self.events),
             'recordings': [item.name for item in self.recordings],
             'left_out': dict(self.left_out)})
         return found
@@ -348,7 +341,7 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
         recorded[0].channels, recorded[0].channel_names)]
     limits = LimitWatch(machine, list(shafts), labels=lambda count: channels,
                         since=lambda number: recorded[number].name)
-    events: list[Event] = []
+    events: list[dict[str, str]] = []
     found: dict[Key, str] = {}
     for number, item in enumerate(recorded):
         for shaft, monitor in monitors.items():
@@ -360,17 +353,16 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                 mean.header, sequence=number, mean_trigger_speed=1.0,
                 start_time=item.start if clock else math.nan,
                 end_time=item.end if clock else number * _INTERVAL))
-            events += [Event(item.name, line) for line in limits.update(
-                shaft, mean.fitted(monitor.layout) or mean, monitor.usual())]
+            lines = limits.update(shaft, mean.fitted(monitor.layout) or mean, monitor.usual())
             monitor.update(mean)
             now = {key_of(change): change for change in monitor.changes()}
             for key in now.keys() - found.keys():
                 found[key] = item.name
-                since = recorded[now[key].since_sequence].name
-                events.append(Event(item.name, now[key].words(since)))
+                lines.append(now[key].words(recorded[now[key].since_sequence].name))
             for key in [key for key in found if key[0] == shaft and key not in now]:
                 del found[key]
-                events.append(Event(item.name, f'{monitor.words(*key[2:])} of {shaft}, channel '
-                                               f'{key[1]} is back at its baseline'))
+                lines.append(f'{monitor.words(*key[2:])} of {shaft}, channel {key[1]} is back at '
+                             'its baseline')
+            events += [{'recording': item.name, 'text': line} for line in lines]
     return Changes(_baseline(recorded, settings), tuple(recorded), left_out, monitors,
                    tuple(events), found, limits)

@@ -22,11 +22,12 @@ from contextlib import contextmanager, suppress
 import csv
 from dataclasses import asdict, dataclass, field, fields
 import json
+import math
 import os
 from pathlib import Path
 import shutil
 import tempfile
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
@@ -35,7 +36,6 @@ from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
-
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
 TEMPORARY = '.averages.'  # prefix of folders whose files are not finished
 
@@ -44,6 +44,33 @@ _HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycle
 _COLUMNS = ('recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
             'trigger_cycles', 'discarded_cycles', 'channel')
 _WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles')
+
+
+@dataclass(frozen=True)
+class RecordingJob:
+    """One recording to work on: its `name` in the results, its `path`, the folder of its files."""
+
+    name: str
+    path: str
+    folder: str
+
+
+@dataclass(frozen=True)
+class RecordingRow:
+    """What became of one recording: `error` says why it has no result, or ended early."""
+
+    recording: str
+    path: str
+    error: str = ''
+
+
+Row = TypeVar('Row', bound=RecordingRow)
+
+
+def row_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a row from what `json_values` made of them."""
+    return {name: tuple(value) if isinstance(value, list) else
+            math.nan if value is None else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -195,16 +222,19 @@ def stamp(path: Path) -> list[list[Any]]:
         raise RecordingError(f'{path}: {error.strerror}: check the path') from None
 
 
-def write_rows(path: Path, rows: Sequence[Any]) -> None:
-    """Write dataclasses of one type as a table; raises OSError."""
+def write_rows(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """Write rows of recordings as a table, in the order of their names; return them so."""
+    ordered = sorted(rows, key=lambda row: (row.recording, row.path))
+
     def lines(file: TextIO) -> None:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(item.name for item in fields(rows[0]))
-        for row in rows:
+        for row in ordered:
             writer.writerow('; '.join(value) if isinstance(value, tuple) else value
                             for value in asdict(row).values())
 
     write_lines(path, lines)
+    return ordered
 
 
 def remove_unfinished(folder: Path) -> None:

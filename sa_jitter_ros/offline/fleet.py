@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from sa_jitter_ros.offline.cluster import run_on_cluster
-from sa_jitter_ros.offline.processes import attempt, Failure, Processes
+from sa_jitter_ros.offline.processes import attempt, Failure, in_processes
 from sa_jitter_ros.recordings.reading import SUFFIXES
 
 Job = TypeVar('Job')
@@ -93,8 +93,4 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], *, processe
             if job is not jobs[-1]:
                 gc.collect()  # commands let garbage wait, and that of a recording may be large
     else:
-        pool = Processes(function, processes)
-        try:
-            yield from pool.results(jobs)
-        finally:
-            pool.stop()
+        yield from in_processes(function, jobs, processes)

@@ -10,8 +10,6 @@
 
 """Figure of the gear signals: residual, difference, and the modulation of a mesh harmonic."""
 
-from dataclasses import dataclass
-
 from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.averaging.indicators import gear_lines, GearSettings, separate
@@ -22,33 +20,20 @@ from sa_jitter_ros.offline.plotting import (
 from sa_jitter_ros.offline.series import ShaftSeries
 
 
-@dataclass(frozen=True)
-class Modulation:
-    """
-    Amplitude and phase of a mesh harmonic over the angle, (angle,) each.
-
-    `order` is that of the harmonic, `amplitude` is relative to the mean, `phase` is in rad about
-    its mean.
-    """
-
-    order: int
-    amplitude: Array
-    phase: Array
-
-
-def demodulate(waveform: Array, order: int, *, reach: int) -> Modulation:
+def demodulate(waveform: Array, order: int, *, reach: int) -> tuple[Array, Array]:
     """
     Return the modulation of an order of an average (angle,) by the orders up to `reach` beside it.
 
+    It is amplitude over its mean, and phase (rad) about its mean, (angle,) each.
     McFadden, "Detecting fatigue cracks in gears by amplitude and phase demodulation of the meshing
     vibration", Journal of Vibration and Acoustics 108 (1986).
 
     >>> angle = 2.0 * np.pi * np.arange(512) / 512
     >>> mesh = np.cos(19.0 * angle + 0.1 * np.sin(angle))
-    >>> found = demodulate((1.0 + 0.2 * np.cos(angle)) * mesh, 19, reach=9)
-    >>> float(np.abs(found.amplitude - 1.0 - 0.2 * np.cos(angle)).max().round(3))
+    >>> amplitude, phase = demodulate((1.0 + 0.2 * np.cos(angle)) * mesh, 19, reach=9)
+    >>> float(np.abs(amplitude - 1.0 - 0.2 * np.cos(angle)).max().round(3))
     0.0
-    >>> float(np.abs(found.phase - 0.1 * np.sin(angle)).max().round(3))
+    >>> float(np.abs(phase - 0.1 * np.sin(angle)).max().round(3))
     0.0
     """
     points = waveform.size
@@ -60,8 +45,7 @@ def demodulate(waveform: Array, order: int, *, reach: int) -> Modulation:
     mean = np.mean(signal)
     turned = signal * np.exp(-1j * np.angle(mean))
     size = np.abs(signal)
-    return Modulation(order, size / max(float(size.mean()), 1e-300),
-                      np.unwrap(np.angle(turned)))
+    return size / max(float(size.mean()), 1e-300), np.unwrap(np.angle(turned))
 
 
 def strongest_mesh(amplitudes: Array, gear: GearSettings) -> tuple[int, int]:
@@ -99,11 +83,11 @@ def gear_figure(signals: Signals, series: ShaftSeries, gear: GearSettings) -> Fi
                     label='difference: without their sidebands, too')
         order, reach = strongest_mesh(found.amplitudes, gear)
         if order:
-            modulation = demodulate(waveform[channel], order, reach=reach)
-            row[1].plot(angle, 100.0 * (modulation.amplitude - 1.0), color=CORRECTED,
+            amplitude, phase = demodulate(waveform[channel], order, reach=reach)
+            row[1].plot(angle, 100.0 * (amplitude - 1.0), color=CORRECTED,
                         linewidth=0.9, label='amplitude')
             beside = row[1].twinx()
-            beside.plot(angle, np.degrees(modulation.phase), color='tab:purple', linewidth=0.9)
+            beside.plot(angle, np.degrees(phase), color='tab:purple', linewidth=0.9)
             row[1].plot([], [], color='tab:purple', linewidth=0.9, label='phase')
             name = signals.order(series.shaft, order)
             row[1].set_title(f'modulation of {name}, ± {reach} orders', fontsize='medium')

@@ -22,7 +22,7 @@ from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.machine import Machine
-from sa_jitter_ros.offline.files import stamp
+from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, row_values, stamp
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.tacholess.recording import Tacholess
@@ -32,28 +32,22 @@ _JOB = 'job.json'  # what a finished folder is of
 
 
 @dataclass(frozen=True)
-class LoopJob:
-    """One recording: `name` in the results, `path`, folder of its report, parameter file."""
+class LoopJob(RecordingJob):
+    """One recording whose loop is closed, with the parameter file and the keywords of `read`."""
 
-    name: str
-    path: str
-    folder: str
     declared: str
     options: Mapping[str, Any] = field(default_factory=dict)
     tacholess: Tacholess | None = None
 
 
 @dataclass(frozen=True)
-class LoopRow:
+class LoopRow(RecordingRow):
     """
     What became of one recording: `error`, or `verdict` and what was found.
 
     With several shafts the RMS errors are those of the worst one.
     """
 
-    recording: str
-    path: str
-    error: str = ''
     verdict: str = ''
     missing_effects: tuple[str, ...] = ()
     rms_before: float = math.nan
@@ -98,10 +92,7 @@ def loop_file(job: LoopJob) -> LoopRow:
             'tacholess': job.tacholess and asdict(job.tacholess)})
         found = _finished(done)
         if found.get('settings') == settings:
-            values: dict[str, Any] = {
-                name: tuple(value) if isinstance(value, list) else
-                math.nan if value is None else value for name, value in found['row'].items()}
-            return LoopRow(**values)
+            return LoopRow(**row_values(found['row']))
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter('always', DataWarning)
             recording = with_pulses(

@@ -25,6 +25,7 @@ import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.html_parts import figure, kept, page, table
 from sa_jitter_ros.machine import LEVELS, Machine
+from sa_jitter_ros.monitoring.quantities import best_amplitudes
 from sa_jitter_ros.number_text import HALF_95, measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
 from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
@@ -117,9 +118,7 @@ def _limits(signals: Signals) -> Iterator[str]:
 
 def _shaft(signals: Signals, series: ShaftSeries) -> Iterator[str]:
     """Return the orders, bearings and indicators of the last average."""
-    amplitude, error = (np.where(np.isfinite(series.field('corrected_amplitude')[-1]), *(
-        series.field(f'{kind}_{name}')[-1] for kind in ('corrected', 'raw')))
-        for name in ('amplitude', 'standard_error'))
+    amplitude, error, _ = best_amplitudes(series['order_amplitude'][-1])
     size = np.nan_to_num(amplitude)
     channels = sorted(np.argsort(-size.max(axis=1))[:_CHANNELS].tolist())
     strongest = sorted(np.argsort(-size.max(axis=0))[:_ORDERS].tolist())

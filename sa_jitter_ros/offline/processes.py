@@ -15,7 +15,7 @@ import multiprocessing
 from multiprocessing import connection
 import os
 import signal
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from sa_jitter_ros.errors import SaJitterError
 
@@ -52,24 +52,25 @@ def _work(function: Callable[[Any], Any], job: Any, sender: Any) -> None:
         sender.send(error)
 
 
-class Processes(Generic[Job, Result]):
-    """Processes, not more than `count` at a time, each with one job."""
-
-    def __init__(self, function: Callable[[Job], Result], count: int) -> None:
-        self._function, self._count = function, count
-        os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the processes: they share the cores
-        self._context = multiprocessing.get_context('forkserver')
-        self._context.set_forkserver_preload([function.__module__])
-        self._running: dict[Any, tuple[Any, Job]] = {}
-
-    def results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Result | Failure]]:
-        waiting = list(reversed(jobs))
-        while waiting or self._running:
-            while waiting and len(self._running) < self._count:
-                self._start(waiting.pop())
-            ready: list[Any] = connection.wait(list(self._running))
+def in_processes(function: Callable[[Job], Result], jobs: Sequence[Job], count: int
+                 ) -> Iterator[tuple[Job, Result | Failure]]:
+    """Iterate over jobs and results; `count` processes at a time have a job each."""
+    os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the processes: they share the cores
+    context = multiprocessing.get_context('forkserver')
+    context.set_forkserver_preload([function.__module__])
+    waiting, running = list(reversed(jobs)), dict[Any, tuple[Any, Job]]()
+    try:
+        while waiting or running:
+            while waiting and len(running) < count:
+                receiver, sender = context.Pipe(duplex=False)
+                process = context.Process(target=_work, args=(function, waiting[-1], sender),
+                                          daemon=True)
+                process.start()
+                sender.close()  # that the death of the process is the end of the pipe
+                running[receiver] = process, waiting.pop()
+            ready: list[Any] = connection.wait(list(running))
             for receiver in ready:
-                process, job = self._running[receiver]
+                process, job = running[receiver]
                 try:
                     found = receiver.recv()
                 except EOFError:
@@ -77,29 +78,23 @@ class Processes(Generic[Job, Result]):
                     found = Failure(_death(process.exitcode))
                 process.join()
                 receiver.close()
-                del self._running[receiver]
+                del running[receiver]
                 if isinstance(found, OSError):
                     raise found
                 yield job, found
+    finally:
+        _stop([process for process, _ in running.values()])
 
-    def _start(self, job: Job) -> None:
-        receiver, sender = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_work, args=(self._function, job, sender),
-                                        daemon=True)
-        process.start()
-        sender.close()  # that the death of the process is the end of the pipe
-        self._running[receiver] = process, job
 
-    def stop(self) -> None:
-        """End the processes that still run."""
-        for process, _ in self._running.values():
-            process.terminate()
-        for process, _ in self._running.values():
-            process.join(_STOP_SECONDS)
-            if process.is_alive():
-                process.kill()
-                process.join()
-        self._running.clear()
+def _stop(processes: Sequence[Any]) -> None:
+    """End the processes that still run."""
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.join(_STOP_SECONDS)
+        if process.is_alive():
+            process.kill()
+            process.join()
 
 
 def _death(status: int) -> str:

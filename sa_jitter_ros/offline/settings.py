@@ -26,7 +26,7 @@ from sa_jitter_ros.machine import following, Machine, PREFIX
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
-    HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
+    converted, HARDWARE_ID, Parameter, require_shaft_names, unknown_names, Values)
 from sa_jitter_ros.pulses.detector_parameters import detector_of, DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
@@ -36,7 +36,6 @@ FloatArray = NDArray[np.float64]
 AVERAGER, DETECTOR = 'synchronous_averager', 'tach_detector'
 _PARAMETERS = {item.name: item for item in PARAMETERS}
 _SHAFTS = _PARAMETERS['shafts']
-_OF_NODE = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)  # not of the averages
 
 _FIRST_SECONDS = 10.0  # part of a recording from which its settings are chosen
 _ORDERS = 6  # if the recording names none
@@ -98,16 +97,12 @@ class MachineFile:
         if wrong:
             raise ParameterError(f'{AVERAGER} has no parameter {", ".join(wrong)}: give some of '
                                  f'{", ".join(sorted(known))}')
-        unknown = sorted(name for name in values if name not in (*known, *_OF_NODE)
-                         and not name.startswith('qos_overrides.'))
         if params is not None and not known.keys() & (values.keys() - overrides.keys()):
             raise ParameterError(f'{params}: no parameter of {AVERAGER}: give a file with its '
                                  f'section, "/**/{AVERAGER}:" and "ros__parameters:"')
-        return cls({name: known[name].convert(value)
-                    for name, value in values.items() if name in known},
-                   {item.name: item.convert(detector[item.name])
-                    for item in DETECTOR_PARAMETERS if item.name in detector},
-                   '' if params is None else str(params), tuple(unknown), parts,
+        return cls(converted(values, known),
+                   converted(detector, {item.name: item for item in DETECTOR_PARAMETERS}),
+                   '' if params is None else str(params), unknown_names(values, known), parts,
                    str(values.get(HARDWARE_ID.name, '')))
 
 

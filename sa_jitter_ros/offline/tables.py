@@ -28,10 +28,9 @@ def write_tables(output: Path, rows: Sequence[Row]) -> None:
     A recording that ended early, or could not be averaged, has a row with the reason in both.
     Raises OSError.
     """
-    ordered = sorted(rows, key=lambda row: (row.recording, row.path))
+    ordered = write_rows(output / RECORDINGS, rows)
     join_tables(output / TABLE, [output / row.recording for row in ordered if row.averages],
                 [(row.recording, row.error) for row in ordered if row.error])
-    write_rows(output / RECORDINGS, ordered)
 
 
 def write_changes(output: Path, changes: Changes, *, figure: bool) -> None:

@@ -17,7 +17,7 @@ topic is (`/rig/vibration` is `vibration`); a channel map can name others.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 import math
 from pathlib import Path
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import missing_library
+from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import check_bag
 from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, FLOAT32, FLOAT64, IMU, SampleDecoder,
@@ -42,18 +42,6 @@ _MAX_LOST = 1 << 29  # largest gap, in samples of all channels
 _SAME_RATE = 1e-6  # relative
 _IMU_AXES = 'xyz'
 _FILL = 65_536
-
-
-@dataclass(frozen=True)
-class _Extent:
-    """The samples of a topic: how many, at which rate, from when on."""
-
-    channels: int
-    samples: int
-    rate: float
-    start_time: float
-    imu: bool
-    remarks: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -103,36 +91,28 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
     waveform = channel_map.tach if channel_map.tach.startswith('/') else ''
     channels = ChannelMap(tuple(e for e in channel_map.vibration if not e.startswith('/')),
                           '' if waveform else channel_map.tach)
-    with recording_errors(path):
-        with _reader(path) as reader:
-            vibration = _find_topic(
-                reader, topics[0] if topics else '', 'vibration', _SAMPLE_TYPES)
-            tach = _find_topic(reader, waveform, 'tach_waveform', _SAMPLE_TYPES)
-            pulses = _find_topic(reader, '', 'tach_pulse', _PULSE_TYPES)
-            if not vibration:
-                raise RecordingError('no vibration topic among '
-                                     f'{", ".join(sorted(reader.topics)) or "none"}')
-            extent = _measure(reader, vibration, sample_rate)
-            if sample_rate is not None and not math.isclose(extent.rate, sample_rate,
-                                                            rel_tol=_SAME_RATE):
-                raise RecordingError(f'sample_rate {sample_rate} Hz given, but the messages of '
-                                     f'{vibration} say {extent.rate} Hz: leave it out')
-            tach_extent = _measure(reader, tach, sample_rate) if tach else None
-            pulse_times, remarks = _pulses(reader, pulses, keyphasor) if pulses else (None, ())
-        source = BagSource(path, vibration, sample_rate, extent.channels, extent.samples)
-        if tach_extent and abs(tach_extent.start_time - extent.start_time) > TIME_TOLERANCE:
-            raise RecordingError(
-                f'{tach} starts at {tach_extent.start_time} s and {vibration} at '
-                f'{extent.start_time} s: record both from the same moment')
-        return channels.select(Recording(
-            source, extent.rate, start_time=extent.start_time,
-            channel_names=tuple(_IMU_AXES) if extent.imu else (),
-            units=('m/s^2',) if extent.imu else (),
-            tach=None if tach_extent is None else BagSource(
-                path, tach, sample_rate, tach_extent.channels, tach_extent.samples),
-            tach_rate=None if tach_extent is None else tach_extent.rate,
-            pulse_times=pulse_times,
-            remarks=(*extent.remarks, *(tach_extent.remarks if tach_extent else ()), *remarks)))
+    with _reader(path) as reader:
+        topic = _find_topic(reader, topics[0] if topics else '', 'vibration', _SAMPLE_TYPES)
+        tach_topic = _find_topic(reader, waveform, 'tach_waveform', _SAMPLE_TYPES)
+        pulses = _find_topic(reader, '', 'tach_pulse', _PULSE_TYPES)
+        if not topic:
+            raise RecordingError('no vibration topic among '
+                                 f'{", ".join(sorted(reader.topics)) or "none"}')
+        found = _samples(reader, path, topic, sample_rate)
+        if sample_rate is not None and not math.isclose(found.sample_rate, sample_rate,
+                                                        rel_tol=_SAME_RATE):
+            raise RecordingError(f'sample_rate {sample_rate} Hz given, but the messages of '
+                                 f'{topic} say {found.sample_rate} Hz: leave it out')
+        tach = _samples(reader, path, tach_topic, sample_rate) if tach_topic else None
+        pulse_times, remarks = _pulses(reader, pulses, keyphasor) if pulses else (None, ())
+    found = replace(found, pulse_times=pulse_times, remarks=(
+        *found.remarks, *(tach.remarks if tach else ()), *remarks))
+    if tach is None:
+        return channels.select(found)
+    if abs(tach.start_time - found.start_time) > TIME_TOLERANCE:
+        raise RecordingError(f'{tach_topic} starts at {tach.start_time} s and {topic} at '
+                             f'{found.start_time} s: record both from the same moment')
+    return channels.select(replace(found, tach=tach.vibration, tach_rate=tach.sample_rate))
 
 
 class _BlockRun:
@@ -187,10 +167,8 @@ class _BlockRun:
 @contextmanager
 def _reader(path: Path) -> Iterator[Any]:
     """Open a bag; `rosbags` must not compile the message definitions in it."""
-    try:
+    with library('bags are', 'rosbags', 'bags'):
         from rosbags.rosbag2 import Reader
-    except ImportError as error:
-        raise missing_library('bags are', 'rosbags', 'bags') from error
     check_bag(path)
     with Reader(path) as reader:
         if reader.compression_mode == 'message':
@@ -217,16 +195,17 @@ def _type_of(reader: Any, topic: str) -> str:
     return str(reader.topics[topic].msgtype).replace('/msg/', '/')
 
 
-def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
-    """Read a topic once and return the extent of its samples."""
+def _samples(reader: Any, path: Path, topic: str, sample_rate: float | None) -> Recording:
+    """Read a topic once and return its samples as a recording."""
     run = _BlockRun(topic)
     for _ in run.continuous(_blocks(reader, topic, sample_rate)):
         pass
     if run.first is None:
         raise RecordingError(f'{topic} has no messages: record the topic')
     imu = _type_of(reader, topic) == IMU
-    return _Extent(len(run.first.samples), run.received, run.first.sample_rate,
-                   run.first.start_time, imu, run.remarks())
+    source = BagSource(path, topic, sample_rate, len(run.first.samples), run.received)
+    return Recording(source, run.first.sample_rate, tuple(_IMU_AXES) if imu else (),
+                     ('m/s^2',) if imu else (), run.first.start_time, remarks=run.remarks())
 
 
 @cache

@@ -10,13 +10,12 @@
 
 """Channels that hold no vibration: NaN, constant, or at the end of their range."""
 
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.channel_map import ChannelSelection
+from sa_jitter_ros.recordings.channel_map import with_channels
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -110,12 +109,8 @@ def channel_faults(recording: Recording, *, most_lost: float = _MOST_LOST) -> di
 
 def without_channels(recording: Recording, bad: Collection[int]) -> Recording:
     """Return a recording without some channels, the recording itself if none would be left."""
-    rows = tuple(row for row in range(recording.channels) if row not in bad)
-    if not bad or not rows:
-        return recording
-    return replace(recording, vibration=ChannelSelection(recording.vibration, rows),
-                   channel_names=tuple(recording.channel_names[row] for row in rows),
-                   units=tuple(recording.units[row] for row in rows))
+    rows = [row for row in range(recording.channels) if row not in bad]
+    return with_channels(recording, rows) if rows else recording
 
 
 def is_lost(reason: str) -> bool:
@@ -136,9 +131,13 @@ def usable_channels(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     """
     faults = channel_faults(recording)
     lost = {channel for channel, reason in faults.items() if is_lost(reason)}
-    remarks = tuple(
+    return without_channels(recording, lost), fault_texts(recording, faults)
+
+
+def fault_texts(recording: Recording, faults: Mapping[int, str]) -> tuple[str, ...]:
+    """Return a sentence for each bad channel of a recording, with what to do about it."""
+    return tuple(
         f'{recording.channel_names[channel]} {reason}'
-        + (' and is left out: check its sensor and cable' if channel in lost else
+        + (' and is left out: check its sensor and cable' if is_lost(reason) else
            ': lower its gain, or choose a larger range')
         for channel, reason in faults.items())
-    return without_channels(recording, lost), remarks

@@ -10,34 +10,26 @@
 
 """Channel maps: which channels of a file are vibration, and which one is the tach waveform."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, SampleSource
+from sa_jitter_ros.recordings.recording import ChangedSource, Recording, SampleSource
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelSelection:
-    """Some channels of another source, in the order of `rows`."""
+def rows_of(source: SampleSource, rows: Sequence[int]) -> ChangedSource:
+    """Return some channels of a source, in the order of `rows`."""
+    return ChangedSource(source, len(rows), itemgetter(list(rows)))
 
-    source: SampleSource
-    rows: tuple[int, ...]
 
-    @property
-    def channels(self) -> int:
-        """Return the number of channels."""
-        return len(self.rows)
-
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-        return self.source.samples
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks."""
-        for block in self.source.blocks(samples_per_block):
-            yield block[list(self.rows)]
+def with_channels(recording: Recording, rows: Sequence[int]) -> Recording:
+    """Return a recording with some of its channels, in the order of `rows`."""
+    if list(rows) == list(range(recording.channels)):
+        return recording
+    return replace(recording, vibration=rows_of(recording.vibration, rows),
+                   channel_names=tuple(recording.channel_names[row] for row in rows),
+                   units=tuple(recording.units[row] for row in rows))
 
 
 @dataclass(frozen=True)
@@ -85,16 +77,10 @@ class ChannelMap:
     def select(self, recording: Recording) -> Recording:
         """Return the recording with its channels in their roles."""
         rows, tach = self.roles(recording.channel_names)
-        source = recording.vibration
         if tach is not None:
-            recording = replace(recording, tach=ChannelSelection(source, (tach,)),
+            recording = replace(recording, tach=rows_of(recording.vibration, [tach]),
                                 tach_rate=recording.sample_rate)
-        if rows == tuple(range(recording.channels)):
-            return recording
-        return replace(
-            recording, vibration=ChannelSelection(source, rows),
-            channel_names=tuple(recording.channel_names[row] for row in rows),
-            units=tuple(recording.units[row] for row in rows))
+        return with_channels(recording, rows)
 
 
 def find_channel(names: Sequence[str], entry: str) -> int:

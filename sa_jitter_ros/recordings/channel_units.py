@@ -14,7 +14,7 @@ Names, units and sensitivities of vibration channels: `machine.channels` of a ma
 Volts become units once, where vibration enters: in the averager, and when a recording is read.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 import re
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import Parameter
-from sa_jitter_ros.recordings.recording import Recording, SampleSource
+from sa_jitter_ros.recordings.recording import ChangedSource, Recording
 
 FloatArray = NDArray[np.float64]
 #: Channels by name, each with `unit` and `sensitivity`, in the order of the machine file.
@@ -136,23 +136,6 @@ def _plain(name: str) -> str:
     return re.sub(r'\W+', '_', name).lower()
 
 
-@dataclass(frozen=True, eq=False)
-class _ScaledSource:
-    source: SampleSource
-    scale: ChannelScale
-
-    @property
-    def channels(self) -> int:
-        return self.source.channels
-
-    @property
-    def samples(self) -> int:
-        return self.source.samples
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        return map(self.scale.apply, self.source.blocks(samples_per_block))
-
-
 def in_units(recording: Recording, channels: Channels) -> Recording:
     """Return a recording with the names and in the units of a machine; raises ParameterError."""
     if not channels:
@@ -163,6 +146,7 @@ def in_units(recording: Recording, channels: Channels) -> Recording:
         for name, before, after, divisor in zip(scale.names, recording.units, scale.units,
                                                 scale.divisor)
         if divisor == 1.0 and before not in ('', '1') and before != after)
-    return replace(recording, vibration=_ScaledSource(recording.vibration, scale),
+    vibration = ChangedSource(recording.vibration, recording.channels, scale.apply)
+    return replace(recording, vibration=vibration,
                    channel_names=scale.names, units=scale.units,
                    remarks=(*recording.remarks, *remarks))

@@ -85,44 +85,43 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
     times must agree within half a sample, else the mean rate of the times. Raises RecordingError
     if there is neither, or a row is not numeric.
     """
-    with recording_errors(path):
-        layout = layout_of(path)
-        names = list(layout.names)
-        channel_map = channel_map.named(names)
-        layout = layout.with_time(channel_map.time)
-        time = '' if layout.time is None else names[layout.time]
-        wanted = {*channel_map.vibration} or {names[k] for k in layout.used} - {time, ''}
-        if channel_map.tach:
-            wanted.add(channel_map.tach)
-        columns = tuple(k for k, name in enumerate(names) if name in wanted)
-        if not columns:
-            raise RecordingError(f'no column of vibration among {", ".join(names)}: name it with '
-                                 'vibration_channels')
-        times = layout.time
-        cut, samples, start_time, end_time = _extent(path, layout)
-        rate = sample_rate
-        if times is not None and samples > 1:
-            if not end_time > start_time:
-                raise RecordingError(f'time runs from {start_time} to {end_time} s: sort the rows '
-                                     'by time')
-            rate = (samples - 1) / (end_time - start_time)
-            if sample_rate is not None:  # times are rounded, so it is the better of the two
-                if not abs((end_time - start_time) * sample_rate - (samples - 1)) < 1.0:
-                    raise RecordingError(f'sample_rate {sample_rate} Hz given, but the times of '
-                                         f'the file say {rate} Hz: leave it out')
-                rate = sample_rate
-        if rate is None:
-            raise RecordingError(
-                f'no time column among {", ".join(names)}: give its name as time_column, '
-                f'or give the sample_rate{layout.hint}')
-        source = CsvSource(path, layout, columns, samples, times, start_time, rate)
-        remarks = (*layout.remarks, *([
-            f'the file ends in the middle of row {samples}: it was read up to there']
-            if cut else ()))
-        return channel_map.select(Recording(
-            source, rate, start_time=start_time, remarks=remarks,
-            channel_names=tuple(names[column] for column in columns),
-            units=tuple(layout.units[column] for column in columns)))
+    layout = layout_of(path)
+    names = list(layout.names)
+    channel_map = channel_map.named(names)
+    layout = layout.with_time(channel_map.time)
+    time = '' if layout.time is None else names[layout.time]
+    wanted = {*channel_map.vibration} or {names[k] for k in layout.used} - {time, ''}
+    if channel_map.tach:
+        wanted.add(channel_map.tach)
+    columns = tuple(k for k, name in enumerate(names) if name in wanted)
+    if not columns:
+        raise RecordingError(f'no column of vibration among {", ".join(names)}: name it with '
+                             'vibration_channels')
+    times = layout.time
+    cut, samples, start_time, end_time = _extent(path, layout)
+    rate = sample_rate
+    if times is not None and samples > 1:
+        if not end_time > start_time:
+            raise RecordingError(f'time runs from {start_time} to {end_time} s: sort the rows '
+                                 'by time')
+        rate = (samples - 1) / (end_time - start_time)
+        if sample_rate is not None:  # times are rounded, so it is the better of the two
+            if not abs((end_time - start_time) * sample_rate - (samples - 1)) < 1.0:
+                raise RecordingError(f'sample_rate {sample_rate} Hz given, but the times of '
+                                     f'the file say {rate} Hz: leave it out')
+            rate = sample_rate
+    if rate is None:
+        raise RecordingError(
+            f'no time column among {", ".join(names)}: give its name as time_column, '
+            f'or give the sample_rate{layout.hint}')
+    source = CsvSource(path, layout, columns, samples, times, start_time, rate)
+    remarks = (*layout.remarks, *([
+        f'the file ends in the middle of row {samples}: it was read up to there']
+        if cut else ()))
+    return channel_map.select(Recording(
+        source, rate, start_time=start_time, remarks=remarks,
+        channel_names=tuple(names[column] for column in columns),
+        units=tuple(layout.units[column] for column in columns)))
 
 
 def _open(path: Path, layout: CsvLayout) -> TextIO:

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import MAX_FIELD_BYTES, RawArray, recording_from_fields
-from sa_jitter_ros.recordings.libraries import missing_library
-from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.libraries import library
+from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording
 
 _ROWS_BYTES = 1 << 24
@@ -44,11 +44,9 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
     `struct/k/variable`. Raises RecordingError if h5py is not
     installed, the file is broken, or a variable has the wrong class.
     """
-    try:
+    with library('MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
+                 ", or save the file with '-v7'"):
         import h5py
-    except ImportError:
-        raise missing_library('MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
-                              ", or save the file with '-v7'") from None
     with h5py.File(path, 'r') as file:
         variables = dict(islice(_datasets(file, file, '', ()), _MOST_KEYS))
         return recording_from_fields(
@@ -91,9 +89,7 @@ def _array(file: Any, name: str, dataset: Any, limit: int) -> RawArray:
     if dataset.dtype.kind not in 'fiub':
         raise RecordingError(f'{name} has type {dataset.dtype}: give real numbers or text')
     shape, size = dataset.shape, prod(dataset.shape) * dataset.dtype.itemsize
-    if size > limit:
-        raise RecordingError(f'{name}: {size} bytes exceed its limit of {limit}: split the '
-                             'recording')
+    check_size(name, size, limit)
     if size <= IN_MEMORY_BYTES:
         return np.asarray(dataset[()]).T
     check_inflation(name, dataset.id.get_storage_size(), size, 'store it without compression')

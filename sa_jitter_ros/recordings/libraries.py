@@ -10,15 +10,27 @@
 
 """Libraries that read one format of recordings and are optional dependencies."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from sa_jitter_ros.errors import RecordingError
 
 
-def missing_library(reads: str, name: str, extra: str, otherwise: str = '') -> RecordingError:
+@contextmanager
+def library(reads: str, name: str, extra: str, otherwise: str = '') -> Iterator[None]:
     """
-    Return the error for a library that is not installed, but by an `extra` of this package.
+    Raise RecordingError that says how to install a library if an import within it fails.
 
-    >>> print(missing_library('bags are', 'rosbags', 'bags'))  # doctest: +ELLIPSIS
-    bags are read with rosbags, which is not installed: ... 'sa_jitter_ros[bags]' or rosbags
+    `reads` is what it reads, `extra` the one of this package that installs it.
+
+    >>> with library('bags are', 'rosbags', 'bags'):  # doctest: +ELLIPSIS
+    ...     import no_such
+    Traceback (most recent call last):
+    ...
+    sa_jitter_ros.errors.RecordingError: bags are read with rosbags, which is not installed: ...
     """
-    return RecordingError(f'{reads} read with {name}, which is not installed: pip install '
-                          f"'sa_jitter_ros[{extra}]' or {name}{otherwise}")
+    try:
+        yield
+    except ImportError:
+        raise RecordingError(f'{reads} read with {name}, which is not installed: pip install '
+                             f"'sa_jitter_ros[{extra}]' or {name}{otherwise}") from None

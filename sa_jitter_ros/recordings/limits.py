@@ -73,6 +73,12 @@ def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
                     'unit and the scale')
 
 
+def check_size(name: str, size: int, limit: int, remedy: str = 'split the recording') -> None:
+    """Raise RecordingError for an array of a file that takes more than `limit` bytes."""
+    if size > limit:
+        raise RecordingError(f'{name}: {size} bytes exceed its limit of {limit}: {remedy}')
+
+
 def check_inflation(name: str, packed: int, size: int, remedy: str) -> None:
     """Raise RecordingError if `packed` bytes unpack to a `size` that no measurement has."""
     if size > max(IN_MEMORY_BYTES, _MAX_INFLATION * packed):

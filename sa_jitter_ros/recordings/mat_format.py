@@ -41,8 +41,8 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import (
     MAX_FIELD_BYTES, RawArray, recording_from_fields)
 from sa_jitter_ros.recordings.hdf5_format import open_hdf5
-from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.recording import Recording
 
 _Buffer = bytes | mmap.mmap
 
@@ -86,18 +86,17 @@ def open_mat(path: Path, *, acquisition: int, given: Mapping[str, Any],
     Raises RecordingError if the file is broken, of version 4, of version 7.3 without h5py, or a
     variable of a recording has the wrong class.
     """
-    with recording_errors(path):
-        with open(path, 'rb') as file:
-            head = file.read(_HEADER)
-            if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
-                return open_hdf5(path, acquisition=acquisition, given=given,
+    with open(path, 'rb') as file:
+        head = file.read(_HEADER)
+        if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
+            return open_hdf5(path, acquisition=acquisition, given=given,
+                             pulses_suffice=pulses_suffice)
+        order = _byte_order(head)
+        whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    variables = dict(_Reader(order).variables(whole))
+    return recording_from_fields(variables, lambda name, limit: variables[name](limit),
+                                 acquisition=acquisition, given=given,
                                  pulses_suffice=pulses_suffice)
-            order = _byte_order(head)
-            whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        variables = dict(_Reader(order).variables(whole))
-        return recording_from_fields(variables, lambda name, limit: variables[name](limit),
-                                     acquisition=acquisition, given=given,
-                                     pulses_suffice=pulses_suffice)
 
 
 def _byte_order(head: bytes) -> str:
@@ -211,10 +210,8 @@ class _Reader:
                                  f'{limit} bytes: split the recording')
         if matrix.kind == _CELL:
             cells = list(self._cells(data, matrix))
-            size = 4 * len(cells) * max(map(len, cells), default=0)
-            if size > limit:
-                raise RecordingError(f'{matrix.name}: {size} bytes exceed its limit of {limit}: '
-                                     'shorten it')
+            check_size(matrix.name, 4 * len(cells) * max(map(len, cells), default=0), limit,
+                       'shorten it')
             return np.array(cells)
         if matrix.kind == _CHAR:
             return self._text(data, matrix)
@@ -244,9 +241,7 @@ class _Reader:
     def _text(self, data: _Buffer, matrix: _Matrix) -> RawArray:
         """Return the rows of a character matrix."""
         part = self._element(data, matrix.content, matrix.stop)
-        if part.stop - part.start > MAX_FIELD_BYTES:
-            raise RecordingError(f'a text of {part.stop - part.start} bytes exceeds its limit of '
-                                 f'{MAX_FIELD_BYTES}')
+        check_size('a text', part.stop - part.start, MAX_FIELD_BYTES, 'shorten it')
         coding = _TEXTS[part.kind] + (
             {'<': '-le', '>': '-be'}[self._order] if part.kind in (4, 17, 18) else '')
         text = data[part.start:part.stop].decode(coding, 'replace')

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import missing_library
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+from sa_jitter_ros.recordings.libraries import library
+from sa_jitter_ros.recordings.recording import FloatArray, Recording
 
 
 def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
@@ -33,16 +33,13 @@ def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
 
     Raises RecordingError if asammdf is not installed or the file is broken.
     """
-    with recording_errors(path):
-        try:
-            import asammdf
-        except ImportError:
-            raise missing_library('a .mf4 file is', 'asammdf', 'mdf') from None
-        left_out: list[str] = []
-        with asammdf.MDF(path) as file:
-            channels = list(_channels(file, left_out))
-        return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                            left_out=left_out, opened=partial(asammdf.MDF, path))
+    with library('a .mf4 file is', 'asammdf', 'mdf'):
+        import asammdf
+    left_out: list[str] = []
+    with asammdf.MDF(path) as file:
+        channels = list(_channels(file, left_out))
+    return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
+                        left_out=left_out, opened=partial(asammdf.MDF, path))
 
 
 def _channels(file: Any, left_out: list[str]) -> Iterator[Channel]:

@@ -30,9 +30,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields
-from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.fields import CONVERTED, RawArray, recording_from_fields
+from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.recording import Recording
 
 _COPY_BYTES = 1 << 20
 _HEADER_BYTES = 10_000
@@ -46,7 +46,7 @@ def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any],
     Raises RecordingError if the archive is broken, contains pickled objects or a field exceeds its
     limit.
     """
-    with recording_errors(path), _archive(path) as archive:
+    with _archive(path) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
         return recording_from_fields(
             names, lambda name, limit: _member(archive, path, name, limit),
@@ -76,20 +76,10 @@ def write_npz(path: str | os.PathLike[str], recording: Recording, *,
     ...     read(f'{folder}/rig.npz').samples
     2000
     """
-    fields: dict[str, Any] = {
-        'sample_rate': recording.sample_rate, 'tach_rate': recording.tach_rate,
-        'pulse_times': recording.pulse_times, 'start_time': recording.start_time,
-        'pulses_per_revolution': recording.pulses_per_revolution,
-        'pulses_per_trigger': recording.pulses_per_trigger,
-        'missing_teeth': recording.missing_teeth, 'ratio': recording.ratio,
-        'orders': np.array(recording.orders), 'channel_names': np.array(recording.channel_names),
-        'units': np.array(recording.units),
-        'reference_pulse_times': recording.reference_pulse_times,
-        'description': recording.description}
     sources = (('vibration', recording.vibration), ('tach', recording.tach))
     with zipfile.ZipFile(path, 'w') as archive:
-        for name, value in fields.items():
-            if value is not None:
+        for name in CONVERTED:
+            if (value := getattr(recording, name)) is not None:
                 with archive.open(f'{name}.npy', 'w') as stream:
                     npy.write_array(stream, np.asanyarray(value), allow_pickle=False)
         for name, source in sources:
@@ -116,9 +106,7 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str, limit: int) -> RawA
             raise RecordingError(
                 f'{name}: {shape} of {dtype} needs {size} bytes, the file has '
                 f'{info.file_size - start}: it is truncated or broken; copy it again')
-        if size > limit:
-            raise RecordingError(f'{name}: {size} bytes exceed its limit of {limit}: split the '
-                                 'recording')
+        check_size(name, size, limit)
         order: Any = 'F' if fortran else 'C'
         if size <= IN_MEMORY_BYTES:
             data = stream.read(size)

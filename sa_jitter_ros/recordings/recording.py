@@ -10,7 +10,7 @@
 
 """A recording: a description of the machine, and samples that are read block by block."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 import math
@@ -66,6 +66,24 @@ class ArraySource:
         """Iterate over `channel` x `sample` blocks as float64."""
         for start in range(0, self.samples, samples_per_block):
             yield np.array(self.array[:, start:start + samples_per_block], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedSource:
+    """Another source, each of whose blocks is changed: into one of so many `channels`."""
+
+    source: SampleSource
+    channels: int
+    change: Callable[[FloatArray], FloatArray]
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+        return self.source.samples
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        return map(self.change, self.source.blocks(samples_per_block))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +197,9 @@ class Recording:
             raise RecordingError(f'tach of {self.tach.channels} channels: must be one waveform')
         if self.tach_rate is not None:
             check_rate('tach_rate', self.tach_rate, RecordingError)
-        if self.pulses_per_revolution < 1:
-            raise RecordingError(
-                f'pulses_per_revolution {self.pulses_per_revolution}: must be at least 1')
-        if self.pulses_per_trigger is not None and self.pulses_per_trigger < 1:
-            raise RecordingError(
-                f'pulses_per_trigger {self.pulses_per_trigger}: must be at least 1')
+        for name in ('pulses_per_revolution', 'pulses_per_trigger'):
+            if (count := getattr(self, name)) is not None and count < 1:
+                raise RecordingError(f'{name} {count}: must be at least 1')
         if not 0 <= self.missing_teeth < self.pulses_per_revolution:
             raise RecordingError(
                 f'missing_teeth {self.missing_teeth}: must be from 0 to less than '

@@ -23,8 +23,8 @@ from typing import Any
 
 from sa_jitter_ros.recordings.channel_list import Channel, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import missing_library
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.libraries import library
+from sa_jitter_ros.recordings.recording import Recording
 
 
 def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
@@ -33,22 +33,18 @@ def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None)
 
     Raises RecordingError if npTDMS is not installed or the file is broken.
     """
-    with recording_errors(path):
-        try:
-            import nptdms  # noqa: F401 (which `_opened` needs)
-        except ImportError:
-            raise missing_library('a .tdms file is', 'npTDMS', 'tdms') from None
-        with _opened(path) as file:
-            channels = [_channel(group.name, channel)
-                        for group in file.groups() for channel in group.channels()
-                        if channel.dtype is not None and channel.dtype.kind in 'fiub']
-        return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                            opened=partial(_opened, path))
+    with _opened(path) as file:
+        channels = [_channel(group.name, channel)
+                    for group in file.groups() for channel in group.channels()
+                    if channel.dtype is not None and channel.dtype.kind in 'fiub']
+    return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
+                        opened=partial(_opened, path))
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    import nptdms
+    with library('a .tdms file is', 'npTDMS', 'tdms'):
+        import nptdms
     with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
         yield file
 

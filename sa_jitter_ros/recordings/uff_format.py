@@ -23,9 +23,9 @@ import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import missing_library
+from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import MAX_VALUES
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording
 
 _FUNCTION, _GENERAL, _TIME_RESPONSE = 58, 0, 1
 _DIRECTIONS = {1: '+X', 2: '+Y', 3: '+Z', -1: '-X', -2: '-Y', -3: '-Z'}
@@ -37,18 +37,15 @@ def open_uff(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
 
     Raises RecordingError if pyuff is not installed or the file is broken.
     """
-    with recording_errors(path):
-        try:
-            import pyuff
-        except ImportError:
-            raise missing_library('a universal file is', 'pyuff', 'uff') from None
-        if path.stat().st_size > 8 * MAX_VALUES:
-            raise RecordingError(f'{path.stat().st_size} bytes: universal files of at most '
-                                 f'{8 * MAX_VALUES} are read; export .tdms, .mat or .wav')
-        left_out: list[str] = []
-        channels = list(_channels(pyuff.UFF(str(path)), left_out))
-        return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                            left_out=left_out)
+    with library('a universal file is', 'pyuff', 'uff'):
+        import pyuff
+    if path.stat().st_size > 8 * MAX_VALUES:
+        raise RecordingError(f'{path.stat().st_size} bytes: universal files of at most '
+                             f'{8 * MAX_VALUES} are read; export .tdms, .mat or .wav')
+    left_out: list[str] = []
+    channels = list(_channels(pyuff.UFF(str(path)), left_out))
+    return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
+                        left_out=left_out)
 
 
 def _channels(file: Any, left_out: list[str]) -> Iterator[Channel]:

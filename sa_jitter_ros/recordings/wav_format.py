@@ -73,7 +73,7 @@ def open_wav(path: Path) -> Recording:
     short, as by a power failure of the recorder, is read up to its end, with a remark. Raises
     RecordingError if the file is broken or its coding is not supported.
     """
-    with recording_errors(path), open(path, 'rb') as file:
+    with open(path, 'rb') as file:
         form, _, kind = struct.unpack('<4sI4s', file.read(12))
         if form != b'RIFF' or kind != b'WAVE':
             raise RecordingError('is not a RIFF/WAVE file: convert it to .wav or .npz')

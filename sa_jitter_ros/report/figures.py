@@ -21,7 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.effect import Effect, effects_of
+from sa_jitter_ros.effects.effect import effects_of
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
@@ -80,7 +80,7 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
             _distribution_figure(trace))]
     if trace.evidence is None or trace.observation.model.trigger_cycles < _FEWEST_CYCLES:
         return tuple(found)
-    effects, words = _effects(trace), trace.observation.words
+    effects, words = tuple(effects_of(trace.findings)), trace.observation.words
     drawn: Sequence[tuple[str, str, str, Callable[..., Figure]]] = (
         ('pulse_errors', 'Pulse errors',
          'Recovered pulse errors (measured minus true time) of the fitted acquisitions, and those '
@@ -98,10 +98,6 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
     for name, title, caption, draw in drawn:
         found.append(Illustration(name, title, caption, draw(trace.evidence, effects)))
     return tuple(found)
-
-
-def _effects(trace: Trace) -> tuple[Effect, ...]:
-    return tuple(effects_of(trace.findings))
 
 
 def _versions(trace: Trace) -> list[tuple[str, str, Expectation, Residual]]:

@@ -18,8 +18,7 @@ from typing import Any
 
 from sa_jitter_ros.html_parts import figure, kept, page, part, table
 from sa_jitter_ros.inference.trace_result import Trace
-from sa_jitter_ros.number_text import (
-    measured_text, number_text, order_text, percent_text)
+from sa_jitter_ros.number_text import measured_text, order_text, percent_text
 from sa_jitter_ros.report.figures import illustrate, Illustration
 from sa_jitter_ros.report.new_section import ONLY_SHAFT
 from sa_jitter_ros.report.report import parameter_unit
@@ -169,14 +168,14 @@ def _effects(content: Mapping[str, Json]) -> Iterator[str]:
 def _error_table(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
     return table(('', 'before', 'after'), [
-        *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
+        *((text, measured_text(before[key]), measured_text(after[key])) for key, text in _ERRORS),
         ('unsteadiness: unexplained scatter of the amplitudes, which chi2 takes into account',
          *2 * (percent_text(content['unsteadiness']),))])
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
     return table(('effect', 'round', 'held-out score', 'outcome'), [
-        (item['name'], item['round'], number_text(item['held_out_score']),
+        (item['name'], item['round'], measured_text(item['held_out_score']),
          item['rejected_because'] or 'added')
         for item in candidates], kind='cards')
 

@@ -15,7 +15,6 @@ from dataclasses import fields, MISSING
 from typing import Any
 
 from sa_jitter_ros.effects.clock_skew import ClockSkew
-from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -64,18 +63,14 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
     if declared or found:
         values['effects'] = {}
     for name, effect in {**declared, **found}.items():
-        values['effects'][name] = {'enabled': True, **_rounded(effect)}
+        values['effects'][name] = {'enabled': True, **{
+            key: _short(value) for key, value in effect.values.items()}}
         for key in values['effects'][name]:
             if name not in declared:
                 remarks[f'effects.{name}.{key}'] = 'new'
             elif name in found and key != 'enabled':
                 remarks[f'effects.{name}.{key}'] = f'was {declared[name].values[key]}'
     return section_text(_NODE, values, remarks)
-
-
-def _rounded(effect: Effect) -> Mapping[str, Any]:
-    """Return the parameters of an effect without digits that mean nothing."""
-    return {name: _short(value) for name, value in effect.values.items()}
 
 
 def _short(value: Any) -> Any:

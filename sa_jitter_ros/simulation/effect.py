@@ -10,9 +10,11 @@
 
 """The base class of simulated effects, and the properties of the machine that they may use."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
+import re
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +58,19 @@ class Effect:
     >>> float(gearbox.pulses(0.0, 1.0).errors.mean().round(6))
     0.001
     """
+
+    #: What `require_number` demands of each number among the parameters.
+    LIMITS: ClassVar[Mapping[str, Mapping[str, float]]] = {}
+
+    @classmethod
+    def kind(cls) -> str:
+        """Return the name of the effect among the predictor's parameters."""
+        return re.sub('(?<=.)(?=[A-Z])', '_', cls.__name__).lower()
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        for name, limits in self.LIMITS.items():
+            require_number(f'{self.kind()}.{name}', getattr(self, name), **limits)
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return a relative fluctuation of the speed."""
@@ -102,9 +117,9 @@ def slow_process(setting: Setting, std: float, name: str, bandwidth: float) -> S
                         name=name)
 
 
-def require_bandwidth(name: str, value: float) -> None:
-    """Raise ParameterError for a bandwidth of a slow process that is none."""
-    require_number(name, value, minimum=1e-4, below=0.5)
+#: Limits of a number; `BANDWIDTH` is that of a slow process.
+NOT_NEGATIVE, POSITIVE = {'minimum': 0.0}, {'above': 0.0}
+BANDWIDTH = {'minimum': 1e-4, 'below': 0.5}
 
 
 def require_number(name: str, value: float, *, minimum: float = -math.inf,

@@ -19,13 +19,14 @@ interpolators here are not those of the averager, which the simulation serves to
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.effect import (
-    Effect, IndexArray, require_bandwidth, require_number, Setting, Signal, slow_process)
+    BANDWIDTH, Effect, IndexArray, NOT_NEGATIVE, POSITIVE, require_number, Setting, Signal,
+    slow_process)
 from sa_jitter_ros.simulation.random_streams import (
     band_limited, FloatArray, RandomStream, SinusoidSum)
 from scipy.interpolate import CubicSpline
@@ -89,10 +90,7 @@ class JitterScale(Effect):
     """The declared pulse errors are `scale` times as large as declared."""
 
     scale: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('jitter_scale.scale', self.scale, minimum=0)
+    LIMITS: ClassVar = {'scale': NOT_NEGATIVE}
 
     def jitter_factor(self) -> float:
         """Return the scale."""
@@ -104,10 +102,7 @@ class ExcessJitter(Effect):
     """Independent normal errors of the pulse times, `std` in s (electrical noise)."""
 
     std: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('excess_jitter.std', self.std, minimum=0)
+    LIMITS: ClassVar = {'std': NOT_NEGATIVE}
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
         """Return the delay of each pulse."""
@@ -120,12 +115,8 @@ class CorrelatedJitter(Effect):
 
     std: float
     correlation: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('correlated_jitter.std', self.std, minimum=0)
-        require_number('correlated_jitter.correlation', self.correlation, above=-_MAX_CORRELATION,
-                       below=_MAX_CORRELATION)
+    LIMITS: ClassVar = {'std': NOT_NEGATIVE, 'correlation': {
+        'above': -_MAX_CORRELATION, 'below': _MAX_CORRELATION}}
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
         """Return the delay of each pulse."""
@@ -162,10 +153,7 @@ class PathDelay(Effect):
     """All pulses come late by `delay` s, early where it is negative."""
 
     delay: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('path_delay.delay', self.delay)
+    LIMITS: ClassVar = {'delay': {}}
 
     def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
         """Return the later times."""
@@ -177,10 +165,7 @@ class ClockSkew(Effect):
     """The clock of the keyphasor is fast by `skew`: it shows t (1 + skew) at time t."""
 
     skew: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('clock_skew.skew', self.skew, above=-1, below=1)
+    LIMITS: ClassVar = {'skew': {'above': -1, 'below': 1}}
 
     def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
         """Return the times on the fast clock."""
@@ -198,11 +183,7 @@ class KeyphasorQuantisation(Effect):
 
     clock_rate: float
     period_std: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('keyphasor_quantisation.clock_rate', self.clock_rate, above=0)
-        require_number('keyphasor_quantisation.period_std', self.period_std, minimum=0)
+    LIMITS: ClassVar = {'clock_rate': POSITIVE, 'period_std': NOT_NEGATIVE}
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return a relative fluctuation below a tenth of the trigger rate."""
@@ -220,10 +201,7 @@ class MissingPulses(Effect):
     """Every pulse is lost with `probability`."""
 
     probability: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('missing_pulses.probability', self.probability, minimum=0, below=1)
+    LIMITS: ClassVar = {'probability': {'minimum': 0, 'below': 1}}
 
     def kept(self, setting: Setting, index: IndexArray) -> NDArray[np.bool_]:
         """Return which pulses are measured."""
@@ -242,11 +220,7 @@ class SpeedFluctuation(Effect):
 
     acceleration_std: float
     bandwidth: float = 0.2
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('speed_fluctuation.acceleration_std', self.acceleration_std, minimum=0)
-        require_bandwidth('speed_fluctuation.bandwidth', self.bandwidth)
+    LIMITS: ClassVar = {'acceleration_std': NOT_NEGATIVE, 'bandwidth': BANDWIDTH}
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return the relative fluctuation whose derivative is the acceleration."""
@@ -267,11 +241,7 @@ class PhaseWander(Effect):
 
     std: float
     bandwidth: float = 0.4
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('phase_wander.std', self.std, minimum=0)
-        require_bandwidth('phase_wander.bandwidth', self.bandwidth)
+    LIMITS: ClassVar = {'std': NOT_NEGATIVE, 'bandwidth': BANDWIDTH}
 
     def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
         """Return the angle in rad of the shaft."""
@@ -289,11 +259,7 @@ class AmplitudeModulation(Effect):
 
     std: float
     bandwidth: float = 0.4
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('amplitude_modulation.std', self.std, minimum=0)
-        require_bandwidth('amplitude_modulation.bandwidth', self.bandwidth)
+    LIMITS: ClassVar = {'std': NOT_NEGATIVE, 'bandwidth': BANDWIDTH}
 
     def gain(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
         """Return the factor."""
@@ -377,11 +343,7 @@ class InterferingTone(Effect):
 
     frequency: float
     amplitude: float
-
-    def __post_init__(self) -> None:
-        """Check the parameters."""
-        require_number('interfering_tone.frequency', self.frequency, above=0)
-        require_number('interfering_tone.amplitude', self.amplitude, minimum=0)
+    LIMITS: ClassVar = {'frequency': POSITIVE, 'amplitude': NOT_NEGATIVE}
 
     def added(self, setting: Setting, start: int, stop: int) -> FloatArray:
         """Return the tone."""
@@ -391,22 +353,10 @@ class InterferingTone(Effect):
 
 
 # Effects are applied in this order: a delay before the clock, its skew before its quantisation.
-EFFECTS: Mapping[str, type[Effect]] = {
-    'jitter_scale': JitterScale,
-    'excess_jitter': ExcessJitter,
-    'correlated_jitter': CorrelatedJitter,
-    'target_geometry': TargetGeometry,
-    'path_delay': PathDelay,
-    'clock_skew': ClockSkew,
-    'keyphasor_quantisation': KeyphasorQuantisation,
-    'missing_pulses': MissingPulses,
-    'speed_fluctuation': SpeedFluctuation,
-    'phase_wander': PhaseWander,
-    'amplitude_modulation': AmplitudeModulation,
-    'interpolation_loss': InterpolationLoss,
-    'additive_noise': AdditiveNoise,
-    'interfering_tone': InterferingTone,
-}
+EFFECTS: Mapping[str, type[Effect]] = {kind.kind(): kind for kind in (
+    JitterScale, ExcessJitter, CorrelatedJitter, TargetGeometry, PathDelay, ClockSkew,
+    KeyphasorQuantisation, MissingPulses, SpeedFluctuation, PhaseWander, AmplitudeModulation,
+    InterpolationLoss, AdditiveNoise, InterferingTone)}
 
 
 def make_effects(options: Mapping[str, Mapping[str, Any]]) -> tuple[Effect, ...]:

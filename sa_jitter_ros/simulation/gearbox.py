@@ -17,7 +17,7 @@ read: they are computed in chunks at fixed indices, and the last chunk is kept.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 import math
 from operator import add
 
@@ -28,9 +28,11 @@ from sa_jitter_ros.simulation.components import ChippedTooth, ComplexArray, Comp
 from sa_jitter_ros.simulation.effect import Effect, require_number, Setting
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
-from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream, SinusoidSum, ZERO
+from sa_jitter_ros.simulation.random_streams import (
+    FloatArray, in_chunks, RandomStream, SinusoidSum, ZERO)
 
 CHUNK = 4096
+Chunk = Callable[[int], FloatArray]  # of this number
 _PULSE_MARGIN = 3  # pulses beyond a window that may be in it because of their errors
 
 
@@ -169,7 +171,7 @@ class Gearbox:
 
     def vibration(self, start: int, stop: int) -> FloatArray:
         """Return samples `start` to `stop`, `channel` x `sample`."""
-        return self._vibration.read(start, stop)
+        return self._read(self._vibration, start, stop)
 
     def blocks(self, stop: int, samples_per_block: int = CHUNK) -> Iterator[FloatArray]:
         """Iterate over the first `stop` samples in `channel` x `sample` blocks."""
@@ -178,7 +180,7 @@ class Gearbox:
 
     def tach_waveform(self, start: int, stop: int) -> FloatArray:
         """Return samples `start` to `stop` of the keyphasor waveform, at `keyphasor.rate`."""
-        return np.asarray(self._waveform.read(start, stop)[0])
+        return np.asarray(self._read(self._waveform, start, stop)[0])
 
     def pulses(self, start: float, stop: float) -> Pulses:
         """Return the pulses measured from time `start` (s) on and before `stop`, in order."""
@@ -208,15 +210,22 @@ class Gearbox:
             times = effect.observed(self.setting, times)
         return times
 
-    @cached_property
-    def _vibration(self) -> '_Chunks':
-        return _Chunks(self._vibration_chunk)
+    @staticmethod
+    def _read(chunk: Chunk, start: int, stop: int) -> FloatArray:
+        if not 0 <= start <= stop:
+            raise ParameterError(f'samples {start} to {stop}: must be 0 <= start <= stop')
+        return in_chunks(chunk, start, stop, CHUNK)
 
     @cached_property
-    def _waveform(self) -> '_Chunks':
-        return _Chunks(self._waveform_chunk)
+    def _vibration(self) -> Chunk:
+        return lru_cache(maxsize=1)(self._vibration_chunk)
 
-    def _vibration_chunk(self, start: int, stop: int) -> FloatArray:
+    @cached_property
+    def _waveform(self) -> Chunk:
+        return lru_cache(maxsize=1)(self._waveform_chunk)
+
+    def _vibration_chunk(self, number: int) -> FloatArray:
+        start, stop = number * CHUNK, (number + 1) * CHUNK
         samples = None
         for effect in self.effects:
             if samples is None:
@@ -251,7 +260,8 @@ class Gearbox:
             total += part
         return total
 
-    def _waveform_chunk(self, start: int, stop: int) -> FloatArray:
+    def _waveform_chunk(self, number: int) -> FloatArray:
+        start, stop = number * CHUNK, (number + 1) * CHUNK
         keyphasor, motion = self.keyphasor, self.setting.motion
         times = np.arange(start, stop) / keyphasor.rate
         pulses, kept = self._pulses_around(times[0], times[-1])
@@ -269,23 +279,3 @@ class Gearbox:
         waveform = keyphasor.shape(within, rise)
         noise = RandomStream(self.seed, 'keyphasor noise').normal(start, stop)
         return waveform + keyphasor.noise_std * noise
-
-
-class _Chunks:
-    """Reads any range of samples from chunks at fixed indices, and keeps the last chunk."""
-
-    def __init__(self, evaluate: Callable[[int, int], FloatArray]) -> None:
-        self._evaluate = evaluate
-        self._number: int | None = None
-        self._held = np.empty((0, 0))
-
-    def read(self, start: int, stop: int) -> FloatArray:
-        if not 0 <= start <= stop:
-            raise ParameterError(f'samples {start} to {stop}: must be 0 <= start <= stop')
-        pieces = []
-        for number in range(start // CHUNK, max(-(-stop // CHUNK), start // CHUNK + 1)):
-            if number != self._number:
-                self._held = self._evaluate(number * CHUNK, (number + 1) * CHUNK)
-                self._number = number
-            pieces.append(self._held[:, max(start - number * CHUNK, 0):stop - number * CHUNK])
-        return np.concatenate(pieces, axis=1)

@@ -14,6 +14,7 @@ Random numbers and random functions of time.
 They depend on seed, name and index or time only, not on the blocks in which they are read.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import zlib
 
@@ -27,6 +28,14 @@ FloatArray = NDArray[np.float64]
 CHUNK = 1024
 _LINES = 48  # sinusoids of a random function
 _NEGLIGIBLE = 1e-17  # correlation below the resolution of a float64
+
+
+def in_chunks(read: Callable[[int], FloatArray], start: int, stop: int, size: int = CHUNK
+              ) -> FloatArray:
+    """Return items `start` to `stop` of rows, of which `read` returns chunks of a fixed size."""
+    first = start // size
+    rows = [read(number) for number in range(first, max(-(-stop // size), first + 1))]
+    return np.concatenate(rows, axis=1)[:, start - first * size:stop - first * size]
 
 
 @dataclass(frozen=True)
@@ -57,11 +66,13 @@ class RandomStream:
 
     def uniform(self, start: int, stop: int) -> FloatArray:
         """Return items `start` to `stop` of every row, uniform in [0, 1)."""
-        return self._read(start, stop, normal=False)
+        return in_chunks(lambda chunk: self._generator(chunk).random((self.rows, CHUNK)),
+                         start, stop)
 
     def normal(self, start: int, stop: int) -> FloatArray:
         """Return items `start` to `stop` of every row, standard normal."""
-        return self._read(start, stop, normal=True)
+        return in_chunks(lambda chunk: self._generator(chunk).standard_normal(
+            (self.rows, CHUNK)), start, stop)
 
     def autoregressive(self, start: int, stop: int, *, correlation: float) -> FloatArray:
         """
@@ -73,25 +84,9 @@ class RandomStream:
             return self.normal(start, stop)
         memory = int(np.ceil(np.log(_NEGLIGIBLE) / np.log(abs(correlation))))
         gain = np.sqrt(1.0 - correlation**2)
-        pieces = [
-            lfilter([gain], [1.0, -correlation],
-                    self.normal(chunk * CHUNK - memory, (chunk + 1) * CHUNK))[:, memory:]
-            for chunk in range(start // CHUNK, -(-stop // CHUNK))]
-        return self._cut(pieces, start, stop)
-
-    def _read(self, start: int, stop: int, *, normal: bool) -> FloatArray:
-        pieces = []
-        for chunk in range(start // CHUNK, -(-stop // CHUNK)):
-            generator = self._generator(chunk)
-            draw = generator.standard_normal if normal else generator.random
-            pieces.append(draw((self.rows, CHUNK)))
-        return self._cut(pieces, start, stop)
-
-    def _cut(self, pieces: list[FloatArray], start: int, stop: int) -> FloatArray:
-        if not pieces:
-            return np.empty((self.rows, 0))
-        offset = start % CHUNK
-        return np.concatenate(pieces, axis=1)[:, offset:offset + stop - start]
+        return in_chunks(lambda chunk: lfilter(
+            [gain], [1.0, -correlation],
+            self.normal(chunk * CHUNK - memory, (chunk + 1) * CHUNK))[:, memory:], start, stop)
 
     def _generator(self, chunk: int) -> np.random.Generator:
         key = np.random.SeedSequence([self.seed, zlib.crc32(self.name.encode())])
