@@ -42,8 +42,7 @@ _STRONGEST = 3e-3  # of the strongest line; below it are side lobes and distorti
 # Width of a line's place in bins of the spectrum.
 _WIDTH = 0.6
 _FOLLOWS = 0.7  # probability that a line is an order of a shaft that is considered
-# Log evidence of a family on fractions of the mark rate, which gear ratios are, too.
-_COINCIDENCE, _ONE_OF_MANY = 2.5, 1.0
+_COINCIDENCE = 2.5  # the most that families on fractions of the mark rate say: ratios are, too
 _MEMBER = 0.25  # what each further multiple of a line says, in parts of the first
 # A vibration that repeats several times in a revolution is so improbable.
 _SYMMETRY = 1.5
@@ -52,9 +51,9 @@ _PRIOR = 3.0  # log probability that the shaft of interest carries the tach
 _LARGEST_RATIO, _SMALLEST_RATIO = 30.0, 0.05
 # Marks of usual targets and encoders divide one of these; what the others are less probable by.
 _DIVIDED, _UNUSUAL = (18_000, 4096, 10_000), 2.5
-# Marks that may be uneven, by at least so many revolutions; revolutions and orders whose lines are
-# compared, and by how much sharper one of two is.
-_SEVERAL_MARKS, _EVEN, _MOST_TURNS, _MOST_ORDERS, _SHARPER = 4, 1e-4, 200, 200, 1.001
+# Marks that may be uneven, by at least so many revolutions, and by how much sharper the lines with
+# the one or the other are.
+_SEVERAL_MARKS, _EVEN, _SHARPER = 4, 1e-4, 1.001
 
 
 @dataclass(frozen=True)
@@ -158,10 +157,8 @@ def marks_evidence(lines: ToothLines | None, counts: Sequence[int]) -> dict[int,
     families = _families(lines)
     for count in counts:
         said = [_says(lines, family, count) for family in families]
-        # Where other lines are those of other shafts, one on a fraction may be, too.
-        most = _COINCIDENCE if all(value > 0.0 for value, _ in said) else _ONE_OF_MANY
         chance = sum(value for value, certain in said if not certain)
-        log[count] = sum(value for value, certain in said if certain) + min(chance, most)
+        log[count] = sum(value for value, certain in said if certain) + min(chance, _COINCIDENCE)
     return {count: max([value, *(log[part] - _SYMMETRY - math.log(count / part)
                                  for part in counts if count % part == 0 and part < count)])
             for count, value in log.items()}
@@ -200,8 +197,8 @@ def _says(lines: ToothLines, family: list[int], count: int) -> tuple[float, bool
     """
     Return the log likelihood that a family lies on multiples of 1/count, over any other place.
 
-    It is certain where the lines are whole multiples of the marks, or of a shaft that shows its
-    own revolution; else they may be those of another shaft: gear ratios are fractions, too.
+    It is certain where the lines are whole multiples of the marks; else they may be those of
+    another shaft: gear ratios are fractions, too.
     """
     places = lines.places[family] * count
     width = _WIDTH * lines.step
@@ -210,12 +207,8 @@ def _says(lines: ToothLines, family: list[int], count: int) -> tuple[float, bool
     one = np.where(on, math.log1p(_FOLLOWS / (1.0 - _FOLLOWS) / chance), 0.0)
     weight = np.where(np.arange(one.size) == 0, 1.0, _MEMBER)
     whole = bool(np.all(np.abs(lines.places[family] - np.rint(lines.places[family])) < width))
-    # It turns once in some marks of which a whole number makes a revolution.
-    parts = np.array([part for part in range(2, count + 1) if count % part == 0])
-    once = bool(np.any(np.abs(np.multiply.outer(parts, lines.places[family]) - 1.0)
-                       < width * parts[:, None]))
     # Multiples of a line that is no multiple of 1/count are those of another shaft.
-    return float(weight @ one) if on[0] else 0.0, whole or once
+    return float(weight @ one) if on[0] else 0.0, whole
 
 
 def on_orders(lines: ToothLines, ratio: float) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -251,13 +244,10 @@ def ratio_evidence(lines: ToothLines, teeth: Sequence[int] = ()) -> list[tuple[f
         if not _SMALLEST_RATIO < ratio < _LARGEST_RATIO or abs(ratio - 1.0) < 1e-4:
             continue
         ratio = _fine(lines, ratio, strong)
-        orders, fits = on_orders(lines, ratio)
-        fits &= other
+        fits = on_orders(lines, ratio)[1] & other
         if np.count_nonzero(fits) < _FEWEST_ON_RATIO:
             continue
         score = float(weight[fits].sum()) * _per_line(lines, ratio)
-        if teeth and not np.isin(orders[fits], np.outer(teeth, np.arange(1, 6))).any():
-            score *= 0.5
         log[round(ratio, 9)] = score - _PRIOR - math.log(len(candidates))
     return _normalised(log, lines.step)
 
@@ -296,31 +286,17 @@ def speed_ripples(samples: FloatArray, start: float, rate: float, fitted: Fitted
     Return whether uneven pulses are those of even marks on a shaft whose speed changes in a turn.
 
     The two are alike in the pulse times. The vibration (channel, sample) from `start` (s) decides:
-    its lines over the angle are sharper with the right one.
+    its power over the angle is in fewer lines with the right one.
     """
-    pattern, turned = fitted.pattern, fitted.revolutions
+    pattern = fitted.pattern
     uneven = float(np.ptp(pattern.marks)) / pattern.teeth
     if pattern.present < _SEVERAL_MARKS or uneven < _EVEN or fitted.breaks.size:
         return False
-    end = start + (samples.shape[-1] - 1) / rate
-    inside = (fitted.true >= start) & (fitted.true <= end)
-    if np.count_nonzero(inside) < 4 * pattern.present:
-        return False
-    first, last = math.ceil(turned[inside][0]), math.floor(turned[inside][-1])
-    last = min(last, first + _MOST_TURNS)
-    highest = min(int(0.4 * rate / fitted.mean_speed), _MOST_ORDERS)
-    if last - first < 4 or highest < 2:
-        return False
-    points = 3 * highest * (last - first)
-    grid = first + np.arange(points) * (last - first) / points
-    times = start + np.arange(samples.shape[-1]) / rate
-
-    def sharpness(pulses: FloatArray) -> float:
-        """Return the sum of squared powers of whole orders over the square of their sum."""
-        at = np.interp(grid, turned, pulses)
-        lines = np.array([np.fft.rfft(np.interp(at, times, row)) for row in samples])
-        power = np.sum(np.abs(lines[:, (last - first):(highest + 1) * (last - first):(
-            last - first)]) ** 2, axis=0)
-        return float(np.sum(power**2) / max(np.sum(power) ** 2, np.finfo(np.float64).tiny))
-
-    return sharpness(fitted.measured) > _SHARPER * sharpness(fitted.true)
+    shares = []
+    for times in (fitted.measured, fitted.true):
+        lines = find_lines(samples.T, start, rate, times, fitted.revolutions, weak=True)
+        if lines is None:
+            return False
+        power = lines.levels**2
+        shares.append(float(np.sum(power**2)) / max(float(np.sum(power))**2, 1e-300))
+    return shares[0] > _SHARPER * shares[1]
