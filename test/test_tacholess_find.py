@@ -145,6 +145,18 @@ def test_gap_ends_the_pulses_and_a_dead_channel_costs_itself(run_up):
     assert np.abs(error(replace(found, times=found.times - 100.0), angle)).max() < 0.005
 
 
+def test_pulses_end_where_the_lines_do(run_up):
+    """Ten seconds of lines, then their noise alone."""
+    vibration, angle, _ = run_up
+    faded = vibration.copy()
+    faded[:, int(10.0 * RATE):] = np.random.default_rng(4).standard_normal((2, int(10.0 * RATE)))
+    found = sa.find_pulses(faded, RATE, orders=ORDERS, speed_range=RANGE)
+    assert ' s the lines are too weak' in found.reason
+    assert found.times[0] < 0.5
+    assert 8.5 < found.times[-1] < 10.5
+    assert np.abs(error(found, angle)).max() < 0.005
+
+
 def test_few_lost_samples_cost_nothing(run_up):
     vibration, angle, whole = run_up
     broken = vibration.copy()
@@ -230,8 +242,8 @@ def dense_covariance(steps, walk):
         spread[place + 1, place + 1] = 2.0 * size**2 / MEMORY
     count = len(steps) + 1
     found = np.zeros((count, 9, count, 9))
-    found[0, :, 0] = np.diag(np.array([
-        1e-3, 1e4, 1e3, 10.0, walk.own, 10.0, walk.own, 1e-3, 2.0 * walk.own]) ** 2)
+    own = walk.own * np.array([np.sqrt(2.0 * MEMORY * len(steps)), 1.0])
+    found[0, :, 0] = np.diag(np.concatenate([[10.0, 1e4, 1e3], own, own, 2.0 * own]) ** 2)
     for k, step in enumerate(steps):
         move, new = transition(step, drift, spread)
         for before in range(k + 1):
@@ -247,7 +259,7 @@ def test_states_are_those_of_the_dense_model():
     times = np.cumsum(rng.uniform(0.8, 1.2, 7))
     moments = np.column_stack([0.01 * rng.standard_normal(7), np.full(7, 0.13)])
     seen = Seen(times, moments, np.array([0.5, 1.0]), rng.standard_normal((2, 7)),
-                rng.uniform(5.0, 20.0, (2, 7)), np.zeros((2, 7)))
+                rng.uniform(5.0, 20.0, (2, 7)))
     rows = np.zeros((7, 2, 8, 9))
     for k in range(7):
         rows[k, :, k:k + 2] = seen.rows[k].reshape(2, 2, 9)

@@ -18,21 +18,17 @@ from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.tacholess.found import among, FoundPulses
-from sa_jitter_ros.tacholess.phase import Phase, phase_of
-from sa_jitter_ros.tacholess.rough import Rough, rough_speed
+from sa_jitter_ros.tacholess.phase import Phase, phase_of, UNKNOWN
+from sa_jitter_ros.tacholess.rough import PRESENT, Rough, rough_speed
 
 FloatArray = NDArray[np.float64]
 
-_PRESENT = 0.3  # nats a frame, of an order whose phase is used
-_MOST_ORDERS = 12  # of which the phase is looked at
+_MOST_ORDERS = 8  # of which the phase is looked at
 _BAND = 0.45  # of the sampling rate, up to which lines are used
 _MOST_CELLS = 20_000
 _FEWEST_CELLS = 16
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
-_SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
-_COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
-_UNTIED = 0.15  # rad a cell of their own, of lines that are not of one shaft
-_MISFIT = 20.0  # variance of the residuals of such lines, over that of the noise
+_MOST_TURNS = 1.0  # of the highest order, that the angle may be unknown
 
 
 def find_pulses(vibration: ArrayLike, sample_rate: float, *,
@@ -74,25 +70,26 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
         raise ParameterError(f'maximum_rate is {maximum_rate} per s: give a positive one')
     begin, end = _longest(np.asarray(np.isfinite(samples).any(axis=0)),
                           int(rate / high))
+    if begin == end:
+        raise SignalError('vibration has no finite sample: give another recording')
     lacking = '' if end - begin == samples.shape[1] else (
         f'outside {start + begin / rate:.4g} to {start + end / rate:.4g} s samples are lacking')
     samples, start = samples[:, begin:end], start + begin / rate
     rough = rough_speed(samples, rate, wanted, (low, high), maximum_rate)
-    kept = ~among(wanted, [*hold_out])
-    kept &= (rough.evidence > _PRESENT) & (wanted * rough.speed.max() < _BAND * rate)
-    strongest = np.argsort(-np.where(kept, rough.evidence, -np.inf))[:_MOST_ORDERS]
-    used = wanted[np.sort(strongest)][kept[np.sort(strongest)]]
-    phase = _phase(samples, rate, rough, used) if used.size else None
-    if phase is None:
-        raise SignalError('no line is strong and steady enough to follow its phase: give other '
-                          'orders, fewer in hold_out, or a sensor nearer to their source')
-    if phase.walk.own > _UNTIED or phase.misfit.max() > _MISFIT:
-        together = ', '.join(f'{order:g}' for order in phase.cells.orders)
-        raise SignalError(f'the orders {together} do not turn together, as those of one shaft '
-                          'do: give fewer of them, or another sensor')
-    first, last, reason = _stretch(phase, rough, start)
-    return FoundPulses.between(phase, first, last, start, wanted, '; '.join(
+    kept = ~among(wanted, [*hold_out]) & (rough.evidence > PRESENT) & (
+        wanted * rough.speed.max() < _BAND * rate)
+    strongest = np.argsort(-rough.evidence * kept)[:_MOST_ORDERS]
+    used = np.sort(wanted[strongest[kept[strongest]]])
+    if not used.size:
+        raise SignalError('no line is strong enough to follow its phase: give other orders, '
+                          'fewer in hold_out, or a sensor nearer to their source')
+    phase = _phase(samples, rate, rough, used)
+    first, last, reason = _stretch(phase, start)
+    found = FoundPulses.between(phase, first, last, start, wanted, '; '.join(
         filter(None, [lacking, reason])))
+    if used.max() * np.median(found.standard_errors * found.speed) > _MOST_TURNS:
+        raise SignalError(UNKNOWN)
+    return found
 
 
 def _checked(vibration: ArrayLike) -> FloatArray:
@@ -109,10 +106,10 @@ def _checked(vibration: ArrayLike) -> FloatArray:
 
 
 def _longest(present: NDArray[np.bool_], gap: int) -> tuple[int, int]:
-    """Return begin and end of the most samples (sample,) without a gap of more than `gap`."""
+    """Return begin and end of the longest stretch (item,) without a gap of more than `gap`."""
     known = np.flatnonzero(present)
     if not known.size:
-        raise SignalError('vibration has no finite sample: give another recording')
+        return 0, 0
     cuts = np.flatnonzero(np.diff(known) > gap)
     begins, ends = known[np.r_[0, cuts + 1]], known[np.r_[cuts, known.size - 1]] + 1
     longest = int(np.argmax(ends - begins))
@@ -149,8 +146,7 @@ def _range(speed_range: Sequence[float], rate: float, orders: FloatArray) -> tup
     return float(found[0]), float(found[1])
 
 
-def _phase(samples: FloatArray, rate: float, rough: Rough, orders: FloatArray
-           ) -> Phase | None:
+def _phase(samples: FloatArray, rate: float, rough: Rough, orders: FloatArray) -> Phase:
     """Return the phase in cells that part the orders of lines from each other."""
     spacing = float(np.min(np.diff(np.concatenate([[0.0], orders]))))
     angle = rough.angle(rate, samples.shape[1])
@@ -163,35 +159,17 @@ def _phase(samples: FloatArray, rate: float, rough: Rough, orders: FloatArray
     return phase_of(samples, rate, angle, revolutions, orders)
 
 
-def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
+def _stretch(phase: Phase, start: float) -> tuple[int, int, str]:
     """Return the first and last node of the longest stretch in which the phase is known."""
     pairs, width = phase.posterior.pairs, phase.posterior.mode.shape[1]
     step = np.sqrt(pairs[:, 0, 0] + pairs[:, width, width] - 2.0 * pairs[:, 0, width])
-    cells = np.diff(phase.seen.nodes) / phase.seen.unit
-    surprise = np.sqrt(phase.walk.shaft * cells**5 / 20.0)  # of the angle, by a change of the jerk
-    known = (step / (2.0 * np.pi) < _LOST) & (surprise < _SURPRISE)
-    known &= _agree(phase, rough)
+    known = step / (2.0 * np.pi) < _LOST
     known[[0, -1]] = False  # no cell beyond it
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    begins, ends = edges[::2], edges[1::2]
-    if not len(begins) or (ends - begins).max() < _FEWEST_CELLS:
-        raise SignalError('the lines are too weak, or change too fast, to follow their phase '
-                          'without losing turns: give other orders or another sensor')
-    longest = int(np.argmax(ends - begins))
-    first, last = int(begins[longest]), int(ends[longest])
+    first, last = _longest(known, 1)
+    if last - first < _FEWEST_CELLS:
+        raise SignalError(UNKNOWN)
     nodes = phase.seen.nodes + start
     lost = [f'{side} {nodes[k]:.4g} s' for side, k, end in (
         ('before', first, 1), ('after', last, len(known) - 1)) if k != end]
     return first, last, (f'{" and ".join(lost)} the lines are too weak, or change too fast, to '
                          'follow their phase' if lost else '')
-
-
-def _agree(phase: Phase, rough: Rough) -> NDArray[np.bool_]:
-    """Return in which cells (cell,) phase and spectra have the same speed."""
-    nodes = phase.seen.nodes
-    speed = np.exp(np.interp(nodes, rough.times, np.log(rough.speed)))
-    turns = np.cumsum((phase.states[:, 1] - speed) * np.gradient(nodes)) * phase.highest
-    cells = min(_COMPARED, len(nodes) // 2)
-    apart = np.abs(turns[cells:] - turns[:-cells]) > _SLIPPED
-    wrong = np.convolve(apart, np.ones(cells), mode='full') > 0.5
-    return np.asarray(~wrong[:len(nodes) - 1])

@@ -10,7 +10,7 @@
 
 """Lines of the machine in short cells along an angle: complex amplitudes, and their noise."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 import warnings
 
@@ -48,10 +48,6 @@ class Cells:
     moments: FloatArray
     orders: FloatArray
     values: ComplexArray
-
-    def chosen(self, kept: NDArray[np.bool_]) -> 'Cells':
-        """Return some of the lines."""
-        return replace(self, orders=self.orders[kept], values=self.values[kept])
 
 
 def demodulated(vibration: FloatArray, sample_rate: float, angle: FloatArray, revolutions: int,

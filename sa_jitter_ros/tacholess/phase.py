@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.tacholess.lines import Cells, demodulated, first_correction, noise_power
-from sa_jitter_ros.tacholess.smoother import fitted, Posterior, Seen, STARTS, Walk
+from sa_jitter_ros.tacholess.smoother import fitted, MOST_OWN, Posterior, Seen, STARTS, Walk
 from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.sparse import csr_matrix
@@ -23,15 +24,14 @@ from scipy.sparse import csr_matrix
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+UNKNOWN = ('the lines are too weak, change too fast, or do not turn together, to follow their '
+           'phase without losing turns: give other orders or another sensor')
 _WIDTHS = (8, 32, 128)  # cells over which the own phase of a line is constant, at first and later
-_PASSES = 2
 _NEWTON = 4  # steps to a time of a pulse
-MOST_LINES = 8
 _WHITE = 0.75  # of the variance of overlapping cells remains where their noise is white
-_STRANGE = 25.0  # squared residual over its variance that no noise makes
-_FEWEST_BINS = 8  # over which the slow part of the noise is measured
-_MOST_STRANGE = 0.2  # share of such cells, beyond which the line is
-_LEAST = 40.0  # sum of the ratios of power of line and noise over cells, of a line that is there
+_OWN_AT_FIRST = 0.03  # rad a cell, that a line may turn by itself before its noise is known
+_ROUNDS = 8  # in which the noise of a line becomes that of its residuals
+_KNOWN = 0.1  # of the residuals, as which the noise of before counts: some lines leave none
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,7 @@ class Phase:
     The angle of the shaft from cell to cell.
 
     `posterior` has it in rad of the order `highest`, from `first` revolutions; the lines of
-    `cells` were used, which show what is `seen`; `misfit` (line,) is the variance of residuals
-    over that of the noise.
+    `cells` were used, which show what is `seen`.
     """
 
     cells: Cells
@@ -50,7 +49,6 @@ class Phase:
     walk: Walk
     first: float
     highest: float
-    misfit: FloatArray
 
     @property
     def unit(self) -> FloatArray:
@@ -65,13 +63,7 @@ class Phase:
 
     def angle(self, times: FloatArray) -> FloatArray:
         """Return angles (time,) in revolutions; beyond the nodes it goes on as it was."""
-        nodes, states = self.seen.nodes, self.states
-        found = CubicHermiteSpline(nodes, states[:, 0], states[:, 1])(times)
-        bends = np.diff(states[:, 1]) / np.diff(nodes)
-        for outside, end in ((times < nodes[0], 0), (times > nodes[-1], -1)):
-            after = times[outside] - nodes[end]
-            found[outside] = states[end, 0] + after * (states[end, 1] + 0.5 * after * bends[end])
-        return np.asarray(found)
+        return np.asarray(CubicHermiteSpline(self.seen.nodes, *self.states.T)(times))
 
     def times_of(self, turns: FloatArray) -> FloatArray:
         """Return when the angle is so many revolutions, between the nodes."""
@@ -115,70 +107,55 @@ class Phase:
 
 
 def phase_of(vibration: FloatArray, sample_rate: float, angle: FloatArray, revolutions: int,
-             orders: FloatArray) -> Phase | None:
-    """Return the phase by lines of some orders along a rough angle; None if none is there."""
-    times = np.arange(angle.size) / sample_rate
-    found = None
-    for number in range(_PASSES):
-        found = _smoothed(demodulated(vibration, sample_rate, angle, revolutions, orders), found)
-        if found is None or number == _PASSES - 1:
-            break
-        orders, angle = found.cells.orders, found.angle(times)
-        if not np.all(np.diff(angle) > 0.0):
-            return None
-    return found
+             orders: FloatArray) -> Phase:
+    """Return the phase by lines of some orders along a rough angle; raises SignalError."""
+    found = _smoothed(demodulated(vibration, sample_rate, angle, revolutions, orders), None)
+    angle = found.angle(np.arange(angle.size) / sample_rate)
+    if not np.all(np.diff(angle) > 0.0):
+        raise SignalError(UNKNOWN)
+    return _smoothed(demodulated(vibration, sample_rate, angle, revolutions, orders), found.walk)
 
 
-def _smoothed(cells: Cells, before: Phase | None) -> Phase | None:
-    """Return the phase by the lines of cells, the strongest of them; None if none is there."""
-    if not len(cells.orders):
-        return None
-    correction = first_correction(cells) if before is None else np.zeros(len(cells.times))
-    starts = STARTS if before is None else [before.walk]
-    for width in _WIDTHS if before is None else _WIDTHS[-1:]:
-        seen, kept = _seen(cells, correction, width, trusted=before is not None)
-        cells = cells.chosen(kept)
-        if not len(cells.orders):
-            return None
-        walk, posterior = fitted(seen, starts)
-        starts, highest = [walk], float(cells.orders.max())
-        ends = np.stack([posterior.mode[:-1, :2], posterior.mode[1:, :2]], axis=1)
-        mean = np.sum(ends * seen.taper, axis=(1, 2))
-        correction = mean / (2.0 * np.pi * highest) - (cells.angle - cells.angle[0])
-    misfit, slow = _misfit(seen, posterior)
-    # Residuals that are larger than the noise of the cells count as noise.
-    fair = replace(seen, precision=seen.precision / np.maximum(1.0, np.maximum(
-        misfit, slow))[:, None])
-    return Phase(cells, fair, Posterior(fair, walk), walk, float(cells.angle[0]), highest, misfit)
+def _smoothed(cells: Cells, before: Walk | None) -> Phase:
+    """Return the phase by the lines of cells, along a rough angle or that of a walk before."""
+    highest = float(cells.orders.max())
+    correction, starts = np.zeros(len(cells.times)), STARTS
+    if before is None:
+        correction = first_correction(cells)
+        for width in _WIDTHS:
+            seen = _seen(cells, correction, width)
+            walk, posterior = fitted(seen, starts, _OWN_AT_FIRST)
+            starts = (walk,)
+            ends = np.stack([posterior.mode[:-1, :2], posterior.mode[1:, :2]], axis=1)
+            mean = np.sum(ends * seen.taper, axis=(1, 2))
+            correction = mean / (2.0 * np.pi * highest) - (cells.angle - cells.angle[0])
+    else:
+        seen, walk = _seen(cells, correction, _WIDTHS[-1]), before
+        posterior = Posterior(seen, walk)
+    for _ in range(_ROUNDS):
+        seen = replace(seen, precision=seen.precision / _misfit(seen, posterior)[:, None])
+        posterior = Posterior(seen, walk)
+    walk, posterior = fitted(seen, [walk], _OWN_AT_FIRST if before is None else MOST_OWN)
+    return Phase(cells, seen, posterior, walk, float(cells.angle[0]), highest)
 
 
-def _seen(cells: Cells, correction: FloatArray, width: int, *, trusted: bool
-          ) -> tuple[Seen, NDArray[np.bool_]]:
-    """
-    Return what the lines show about an angle, and which of them are strong enough to be kept.
-
-    About an angle that is `trusted`, cells that no noise explains are left out.
-    """
+def _seen(cells: Cells, correction: FloatArray, width: int) -> Seen:
+    """Return what the lines show about an angle."""
     turn = 2.0 * np.pi * cells.orders[:, None]
     present = np.isfinite(cells.values)
     still = np.where(present, cells.values, 0.0) * np.exp(-1j * turn * correction)
-    power = noise_power(np.where(present, still, np.nan))
     width = min(width, max(still.shape[1] // 2, 1))
     own = np.unwrap(np.angle(_mean(still, width)), axis=1)
     still = still * np.exp(-1j * own)
+    power = noise_power(np.where(present, still, np.nan))
     share = np.maximum(_mean(present.astype(float), width).real, 1e-3)
     size = np.maximum(_mean(still, width).real / share, 1e-30)
     precision = np.where(present, 2.0 * size**2 / power, 0.0)
-    strange = precision * (np.abs(still - size) / size) ** 2 > 2.0 * _STRANGE
-    precision[strange & trusted & (strange.mean(axis=1) < _MOST_STRANGE)[:, None]] = 0.0
-    phase = own + still.imag / size + turn * (cells.angle - cells.angle[0] + correction)
-    weight = precision.sum(axis=1)
-    kept = weight > 2.0 * _LEAST
-    strong = np.argsort(-weight * cells.orders**2 * kept)[:MOST_LINES]
-    kept &= np.isin(np.arange(len(kept)), strong)
-    orders = cells.orders[kept]
-    return Seen(cells.times, cells.moments, orders / orders.max(initial=1e-9), phase[kept],
-                precision[kept], (still.real / size - 1.0)[kept]), kept
+    phase = own + still.imag / size
+    phase -= np.sum(precision * phase, axis=1, keepdims=True) / np.maximum(
+        precision.sum(axis=1, keepdims=True), 1e-30)
+    phase += turn * (cells.angle - cells.angle[0] + correction)
+    return Seen(cells.times, cells.moments, cells.orders / cells.orders.max(), phase, precision)
 
 
 def _mean(values: NDArray[np.generic], width: int) -> ComplexArray:
@@ -187,14 +164,11 @@ def _mean(values: NDArray[np.generic], width: int) -> ComplexArray:
                       + 1j * uniform_filter1d(values.imag, width, axis=1, mode='nearest'))
 
 
-def _misfit(seen: Seen, posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-    """Return variances (line,) over those of white noise: of residuals, and of the slow noise."""
+def _misfit(seen: Seen, posterior: Posterior) -> FloatArray:
+    """Return the variance (line,) of residuals over that of white noise."""
     rows, precision = seen.rows, seen.precision
     known = np.sum((rows @ posterior.pairs) * rows, axis=2).T
+    few = _KNOWN * np.count_nonzero(precision, axis=1) + 1.0
     left = np.sum((precision > 0.0) * (1.0 - precision * known), axis=1)
-    found = np.sum(precision * posterior.rest**2, axis=1) / np.maximum(left, 1.0) / _WHITE
-    # The phase follows what is slow in the noise; the amplitude shows how much of that there is.
-    band = max(int(0.5 * np.sum(precision * known)), _FEWEST_BINS)
-    slow = np.abs(np.fft.rfft(np.sqrt(precision) * seen.amplitude, axis=1)[:, 1:band + 1]) ** 2
-    level = slow.mean(axis=1) / np.maximum(np.count_nonzero(precision, axis=1), 1)
-    return found, np.where(level > 1.0 + 3.0 / np.sqrt(slow.shape[1]), level, 1.0)
+    return np.asarray((np.sum(precision * posterior.rest**2, axis=1) / _WHITE + few)
+                      / (np.maximum(left, 0.0) + few))

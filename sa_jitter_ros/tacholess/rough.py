@@ -27,10 +27,9 @@ _COARSEST = 0.02  # step of the speeds, relative
 _NEAR = 2.5  # bins of the lowest order within which a path is the same
 _AMBIGUOUS = 0.8  # share of the evidence of the best path that no other may have
 _FEW = 0.4  # less of it, if there is only one order
-_PRESENT = 0.4  # nats a frame, of an order that is there
+PRESENT = 0.4  # nats a frame, of an order that is there
 _AT_EDGE = 0.3  # share of the frames in which the speed may be at the end of its range
 _STILL = 12.0  # revolutions of a window, where run-ups stand still
-_AGAIN = 2  # times that the path is sought about the one before
 _FINER = 0.04  # relative change of the speed that the second path may make
 
 
@@ -96,9 +95,8 @@ def rough_speed(vibration: FloatArray, sample_rate: float, orders: FloatArray,
     speed = best.speeds[best.path]
     _require_one(best, speed, orders, speed_range)
     found = Rough(best.spectra.times, speed, _by_order(best.spectra, speed, orders))
-    for _ in range(_AGAIN):
-        _require_most(found, orders)
-        found = _finer(vibration, sample_rate, orders, found, spacing)
+    _require_most(found, orders)
+    found = _finer(vibration, sample_rate, orders, found, spacing)
     _require_most(found, orders)
     return found
 
@@ -133,7 +131,7 @@ def _require_one(track: _Track, speed: FloatArray, orders: FloatArray,
     low, high = speed_range
     found = _by_order(track.spectra, speed, orders)
     ranged = f'between {low:g} and {high:g} Hz'
-    if track.total <= 0.0 or found.max() < _PRESENT:
+    if track.total <= 0.0 or found.max() < PRESENT:
         raise SignalError(f'no lines of the orders {_text(orders)} stand out {ranged}: give the '
                           'orders that the vibration has, or a sensor nearer to their source')
     if track.other > (_AMBIGUOUS - _FEW / len(orders)**2) * track.total:
@@ -147,7 +145,7 @@ def _require_one(track: _Track, speed: FloatArray, orders: FloatArray,
 
 def _require_most(found: Rough, orders: FloatArray) -> None:
     """Raise SignalError unless most orders are there: half of them may be those of a multiple."""
-    present = np.count_nonzero(found.evidence > _PRESENT)
+    present = np.count_nonzero(found.evidence > PRESENT)
     if 2 * present <= len(orders):
         raise SignalError(f'only {present} of the orders {_text(orders)} stand out at '
                           f'{np.median(found.speed):.4g} Hz, which may be a guess: give those '

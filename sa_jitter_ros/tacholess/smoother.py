@@ -34,10 +34,9 @@ FloatArray = NDArray[np.float64]
 _SHAFT, _OWN = 3, 2  # states of the shaft, and of a line
 MEMORY = 100.0  # cells that the rate of the phase of a line lasts: about a resonance
 _SHARED = 2.0  # of what lines turn by themselves, all turn: resonances have one direction
-_WIDE = (1e-3, 1e4, 1e3)  # standard deviations of them at the first node, rad, rad/cell, ...
-_WIDE_PHASE = 10.0  # rad, of the own phase of a line at the first node
+_WIDE = (10.0, 1e4, 1e3)  # standard deviations of them at the first node, rad, rad/cell, ...
 _UNSCALED = np.linalg.inv([[1 / 20, 1 / 8, 1 / 6], [1 / 8, 1 / 3, 1 / 2], [1 / 6, 1 / 2, 1]])
-_RANGE = np.log([[1e-12, 1e4], [1e-7, 1.0]])  # of the sizes of walks
+MOST_OWN = 0.1  # rad a cell, of lines of one shaft: a resonance takes some tens of cells
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Seen:
 
     `times` (cell,); `moments` (cell, 2) of the time from them, and of its square, over the taper;
     `orders` (line,) over the highest; `phase` (line, cell) in rad with `precision` (line, cell),
-    which is 0 where a line shows nothing; `amplitude` (line, cell) over its running mean, less 1.
+    which is 0 where a line shows nothing.
     """
 
     times: FloatArray
@@ -71,7 +70,6 @@ class Seen:
     orders: FloatArray
     phase: FloatArray
     precision: FloatArray
-    amplitude: FloatArray
 
     @cached_property
     def unit(self) -> float:
@@ -172,10 +170,9 @@ class _Prior:
     def __init__(self, steps: FloatArray, width: int, walk: Walk) -> None:
         self._parts = [(slice(0, _SHAFT), *_jerk(steps, walk.shaft), np.array(_WIDE))]
         for begin in range(_SHAFT, width, _OWN):
-            shared = begin == width - _OWN
-            size = _SHARED * walk.own if shared else walk.own
-            self._parts.append((slice(begin, begin + _OWN), *_wander(steps, size), np.array(
-                [_WIDE[0] if shared else _WIDE_PHASE, size])))
+            size = _SHARED * walk.own if begin == width - _OWN else walk.own
+            self._parts.append((slice(begin, begin + _OWN), *_wander(steps, size), size * np.array(
+                [np.sqrt(2.0 * MEMORY * len(steps)), 1.0])))
         self.diagonal = np.zeros((len(steps) + 1, width, width))
         self.below = np.zeros((len(steps), width, width))
         for place, kept, inverse, first in self._parts:
@@ -216,17 +213,23 @@ def _wander(steps: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
     return kept, np.linalg.inv(new) / size**2
 
 
-def fitted(seen: Seen, starts: Sequence[Walk]) -> tuple[Walk, Posterior]:
-    """Return the walk with the most evidence, sought beside one of `starts`, and its states."""
+def fitted(seen: Seen, starts: Sequence[Walk], most: float = MOST_OWN) -> tuple[Walk, Posterior]:
+    """
+    Return the walk with the most evidence, sought beside one of `starts`, and its states.
+
+    Lines turn by themselves by up to `most`, rad a cell.
+    """
+    bounds = np.log([[1e-12, 1e4], [1e-7, most]]).T
+
     def walk_of(sizes: FloatArray) -> Walk:
-        return Walk(*np.exp(np.clip(sizes, *_RANGE.T)).tolist())
+        return Walk(*np.exp(np.clip(sizes, *bounds)).tolist())
 
     def loss(sizes: FloatArray) -> float:
         try:
             evidence = Posterior(seen, walk_of(sizes)).evidence
         except (LinAlgError, np.linalg.LinAlgError):
             return 1e12
-        return -evidence + 10.0 * float(np.sum((sizes - np.clip(sizes, *_RANGE.T)) ** 2))
+        return -evidence + 10.0 * float(np.sum((sizes - np.clip(sizes, *bounds)) ** 2))
 
     begin = min((np.log([walk.shaft, walk.own]) for walk in starts), key=loss)
     walk = walk_of(minimize(loss, begin, method='Nelder-Mead', options={
