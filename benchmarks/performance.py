@@ -159,7 +159,7 @@ def _closed(item: Mapping[str, Any]) -> tuple[str, str, str]:
     return (f'`close_loop`, recording of {item["megabytes"]:.1f} MB ({item["channels"]} channels, '
             f'{item["seconds"]:.0f} s, gears: {item["gears"]}), found {found}; least of 5',
             f'{item["wall"]:.1f} s ({item["cpu"]:.1f} s of CPU)',
-            'below 3 s' if item['megabytes'] < 20.0 else 'below 10 s')
+            'below 4 s' if item['megabytes'] < 20.0 else 'below 8 s')
 
 
 def _graph(runs: Iterable[Mapping[str, Any]]) -> str:
