@@ -50,8 +50,8 @@ Distribution = AmplitudeDistribution | SampledDistribution
 RESOLUTION = 5e-4
 _NODES = 32  # of an integral over a cycle, and of each panel of a longer one
 _PLACES = 12  # in a cycle, where errors turn hardly
-# Draws of all lines of all acquisitions together: as many as take less time than the moments.
-_MOST_VALUES, _MOST_DRAWS = 1_000_000, 4096
+# Draws of all lines of all acquisitions together: many, of each as many as tell a mean, at most.
+_MANY_VALUES, _ENOUGH, _MOST_VALUES = 200_000, 4096, 1_000_000
 # Speeds closer than this are the same: no amplitude changes by more than 1e-3.
 _SPEED_STEP = 2e-3
 _SHARPEST = 2.0
@@ -193,7 +193,8 @@ class Expectation:
 
     @property
     def _most(self) -> int:
-        return min(_MOST_DRAWS, max(COARSEST, _MOST_VALUES // self.noise.size))
+        size = self.noise.size
+        return max(COARSEST, min(max(_ENOUGH, _MANY_VALUES // size), _MOST_VALUES // size))
 
     def _gathered(self, distributions: Sequence[Distribution], name: str) -> Array:
         values = np.empty(self.noise.size)
