@@ -10,15 +10,19 @@
 
 """What commands share: output that cannot be written, and the machine file of recordings."""
 
+from functools import partial
 import io
 from pathlib import Path
+import signal
 import subprocess
 import sys
+from threading import Thread
 
 from bench import SteadyClock
 import numpy as np
 import pytest
-from sa_jitter_ros.commands import average, check_keyphasor, close_loop, loop_run, progress
+from sa_jitter_ros.commands import (
+    average, check_keyphasor, close_loop, layouts, loop_run, progress)
 from sa_jitter_ros.parameter_file import shipped
 
 
@@ -65,6 +69,18 @@ def test_stopped_loop_says_so_in_one_line_and_writes_nothing(tmp_path, capsys, m
                             '--output', str(tmp_path / 'report')]) == 130
     assert capsys.readouterr().err == 'close_loop: stopped before the report was written\n'
     assert not (tmp_path / 'report' / 'report.json').exists()
+
+
+def test_command_runs_in_any_thread_and_gives_sigterm_back(tmp_path, capsys):
+    before, status = signal.getsignal(signal.SIGTERM), []
+    command = partial(layouts.main, [
+        '--params', str(shipped('machine.yaml')), '--output', str(tmp_path)])
+    thread = Thread(target=lambda: status.append(command()))
+    thread.start()
+    thread.join()
+    assert [*status, command()] == [0, 0]
+    assert capsys.readouterr().err == ''
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypatch):

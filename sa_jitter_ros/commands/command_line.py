@@ -25,6 +25,7 @@ import warnings
 
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.nodes.lifetime import in_main_thread
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.settings import AVERAGER, section
 from sa_jitter_ros.recordings.channel_units import channels_of
@@ -76,10 +77,13 @@ def run_to_end(run: Callable[[argparse.Namespace, Progress], Found],
     """
     Run what finds something and writes into `options.output`, and `tell` it; return the status.
 
-    It is 2 after one line for what cannot be used or written, 130 for SIGINT and SIGTERM.
+    It is 2 after one line for what cannot be used or written, 130 for SIGINT and SIGTERM, which
+    only the main thread handles.
     """
     use_one_thread()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    before = signal.getsignal(signal.SIGTERM)
+    if in_main_thread():
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         require_writable(options.output)
         found = run(options, progress)
@@ -93,6 +97,9 @@ def run_to_end(run: Callable[[argparse.Namespace, Progress], Found],
     except KeyboardInterrupt:
         progress.say(stopped)
         return 130
+    finally:
+        if in_main_thread():
+            signal.signal(signal.SIGTERM, before)
     return tell(options, found)
 
 

@@ -31,7 +31,8 @@ _SOON = 0.5  # s in which a process ends that has nothing else to do
 _MONOTONIC, _THREAD = 1, 2  # CLOCK_MONOTONIC, SIGEV_THREAD
 
 
-def _in_main_thread() -> bool:
+def in_main_thread() -> bool:
+    """Return whether this is the thread that handles signals."""
     return threading.current_thread() is threading.main_thread()
 
 
@@ -53,7 +54,7 @@ class InterruptOnce:
 
     def __init__(self) -> None:
         self.ending = False
-        if _in_main_thread():
+        if in_main_thread():
             signal.signal(signal.SIGINT, self)
             # Python takes its handlers away when it ends.
             atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
@@ -70,7 +71,7 @@ def _arm(seconds: float, text: ctypes.Array[ctypes.c_char]) -> list[ctypes.c_voi
     library = ctypes.CDLL(None)
     timers: list[ctypes.c_void_p] = []
     calls = ((seconds, 'warnx', ctypes.addressof(text)), (seconds + _EXIT, '_exit', 0))
-    possible = _in_main_thread() and hasattr(library, 'timer_create')
+    possible = in_main_thread() and hasattr(library, 'timer_create')
     for after, name, value in calls if possible else ():
         function = ctypes.cast(getattr(library, name), ctypes.c_void_p)
         event, timer = _Event(value, 0, _THREAD, function), ctypes.c_void_p()
