@@ -210,8 +210,8 @@ def _resampled(average: Average, cycles: ComplexArray, settings: AverageSettings
     The second result is without the leakage between the orders.
     """
     cycles = cycles * average.gains[:, None]
-    return cycles, without_leakage(cycles, settings.orders, settings.cycle_length,
-                                   settings.cycle_length * average.cycle_numbers)
+    angles = average.first_angle + settings.cycle_length * average.cycle_numbers
+    return cycles, without_leakage(cycles, settings.orders, settings.cycle_length, angles)
 
 
 def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
