@@ -184,11 +184,11 @@ def setting_distances(setting: Setting, trials: int, seed: int
 
 
 def setting_average(setting: Setting, rng: np.random.Generator) -> sa.Average:
-    """Return a corrected average of a setting."""
+    """Return the second corrected average of a setting, which begins anywhere in a revolution."""
     orders, size, cycles = np.array(setting.orders), np.array(setting.size), setting.cycles
     rate, speed = setting.points / PERIOD, setting.ratio / PERIOD
-    times = np.arange((cycles + 4 + _SPARE) * setting.points) / rate
-    pulses = PERIOD * (2.0 + rng.uniform() / setting.points + np.arange(cycles + 1.0 + _SPARE))
+    times = np.arange((2 * cycles + 4 + _SPARE) * setting.points) / rate
+    pulses = PERIOD * (2.0 + rng.uniform() / setting.points + np.arange(2.0 * cycles + 1 + _SPARE))
     angle = speed * (times - pulses[0])
     samples = 0.05 * rng.standard_normal(times.size)
     if setting.another_shaft:
@@ -210,7 +210,7 @@ def setting_average(setting: Setting, rng: np.random.Generator) -> sa.Average:
     late = pulses + std * rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0)
     with warnings.catch_warnings():
         warnings.simplefilter('ignore')
-        average, *_ = sa.average(
+        _, average, *_ = sa.average(
             samples, rate, late, orders=setting.orders, ratio=setting.ratio,
             trigger_cycles=cycles, correct_jitter=True, interval_tolerance=0.45,
             keyphasor_rate=1.0 / (np.sqrt(12.0) * std))

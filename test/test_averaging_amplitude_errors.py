@@ -15,7 +15,6 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.amplitude_errors import (kurtosis_of, Repeatability, Scatter,
                                                       upper_limit)
-from sa_jitter_ros.averaging.steady_part import steady_part
 
 ORDERS = np.array([16.0, 32.0, 8.0, 5.0, 11.0])  # strong, three times; absent; 10 dB weak
 AMPLITUDES = np.array([1.0, 0.3, 0.5, 0.0, 0.0])
@@ -212,46 +211,3 @@ def test_errors_of_one_cycle_of_silence_and_above_nyquist_are_no_numbers():
     for item in (errors.amplitude, errors.phase, errors.upper_95):
         assert np.isnan(item[:, 2]).all()
         assert np.isfinite(item[:, :2]).all()
-
-
-@pytest.mark.parametrize('count', [12, 40])
-def test_steady_part_has_the_errors_of_its_noise(count):
-    """A tone of another shaft is no noise; where there is none, nothing changes."""
-    rng, trials, noise = np.random.default_rng(count), 200, 0.01
-    z, plain = [], 0
-    for _ in range(trials):
-        white = noise * (rng.standard_normal((count, 1, 3, 2)) @ (1.0, 1.0j))
-        turns = rng.uniform(2.0 / count, 0.4) * np.arange(count) + rng.uniform()
-        tone = np.exp(2j * np.pi * turns)[:, None, None] * [0.3, 0.1, 0.2]
-        found = steady_part(1.0 + tone + white, np.zeros(3))
-        scatter = Scatter.of(found.cycles, found.cycles).inflated(found.inflation, found.lost)
-        z.append((np.abs(found.mean[0]) - 1.0) / scatter.error_of_mean[0])
-        plain += steady_part(1.0 + white, np.zeros(3)).rates.size
-    assert hold(shares(np.array(z).ravel()), trials).all()
-    assert plain <= 1
-
-
-@pytest.mark.parametrize(('count', 'lines', 'least'), [(12, 2, 0.5), (40, 3, 0.99)])
-def test_lines_are_found_where_orders_turn_from_cycle_to_cycle(count, lines, least):
-    """With r = 0.3137 a line turns at another rate in each order; a silent channel tells none."""
-    rng, trials, ratio, found = np.random.default_rng(count), 100, 0.3137, 0
-    orders = np.array([3.0, 8.0, 16.0])
-    for _ in range(trials):
-        others = rng.uniform(20.0, 30.0) * np.arange(1.0, lines + 1.0)
-        own = np.mod(ratio * (others[:, None] - orders), 1.0)
-        turns = np.multiply.outer(np.arange(count), own) + rng.uniform(size=(lines, 1))
-        leaked = 0.1 * np.exp(2j * np.pi * turns).sum(axis=1)
-        cycles = np.zeros((count, 2, 3), np.complex128)
-        cycles[:, 0] = 1.0 + leaked + 1e-3 * (rng.standard_normal((count, 3, 2)) @ (1.0, 1.0j))
-        steady = steady_part(cycles, ratio * orders)
-        np.testing.assert_array_equal(steady.mean[1], 0.0)
-        far = np.abs(np.mod(own + 0.5, 1.0) - 0.5).min(axis=0) > 2.5 / count
-        near = np.abs(steady.mean[0] - 1.0) < 5e-3
-        found += np.all(near | ~far)
-    assert found >= least * trials
-
-
-def test_steady_part_keeps_what_is_slower_than_the_average():
-    slow = 1.0 + 0.1 * np.cos(np.pi * np.arange(40) / 40)[:, None, None] * np.ones((1, 2))
-    found = steady_part(slow + 0j, np.zeros(2))
-    np.testing.assert_allclose(found.mean, slow.mean(axis=0), atol=0.02)

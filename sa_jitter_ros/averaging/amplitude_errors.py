@@ -24,7 +24,7 @@ A few cycles show their scatter only roughly. The standard errors are enlarged b
 (`widened`) that 1 and 1.96 of them contain 68 % and 95 %, as those of a normal distribution do.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 import math
 from math import pi
@@ -227,11 +227,6 @@ class Scatter:
         noise = np.maximum(noise, (_ROUNDING * size) ** 2 + _TINY)
         leaked = np.hypot(_ANY_ANGLE * np.abs(cycles.mean(axis=0) - mean), np.sqrt(tones[0]))
         return cls(mean, noise, freedom, leaked, radial, tangential)
-
-    def inflated(self, factor: FloatArray, lost: FloatArray) -> 'Scatter':
-        """Return that with a `factor` on the noise, which has `lost` degrees of freedom."""
-        return replace(self, noise=self.noise * factor,
-                       freedom=np.maximum(self.freedom - lost, 1.0))
 
     @property
     def error_of_mean(self) -> FloatArray:

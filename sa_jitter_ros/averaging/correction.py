@@ -11,7 +11,7 @@
 """The corrected average: pulse errors are recovered from the vibration and removed."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 import math
 
@@ -27,10 +27,10 @@ from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.noise import attenuation, leaks_apart, without_leakage
+from sa_jitter_ros.averaging.other_lines import coherent, other_lines
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
-from sa_jitter_ros.averaging.steady_part import steady_part
 from sa_jitter_ros.pulses.resampling import periodic
 
 FloatArray = NDArray[np.float64]
@@ -227,16 +227,18 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
     if raw.discarded_cycles and not np.isfinite(raw.waveform).all():
         return _uncorrected(raw, 'cycles were discarded, and what is left has no whole '
                                  'fundamental cycle that tells what they were: average more')
-    recovery, refitted = _refitted(raw, cycles, settings, grids)
-    periods = raw.periods
-    largest, reach = np.abs(recovery.expected).max(), _REACH * periods.min()
-    reason = recovery.reason if largest <= reach else (
-        f'a pulse error of {largest:.3g} s is above {reach:.3g} s, {_REACH:.0%} of a trigger '
-        'cycle: check the pulses')
-    if reason:
-        return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
-    corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
-    aligned, scatter = _steady(corrected, settings)
+    candidates = np.empty(0) if raw.discarded_cycles else other_lines(
+        grids.of(cycles, settings.interpolation)[1], raw.orders, settings.cycle_length)
+    found = _aligned(raw, cycles, settings, candidates, grids)
+    if isinstance(found, Correction):
+        return found
+    lines = _coherent(found.average, settings, candidates)
+    if lines.size:
+        again = _aligned(raw, cycles, _beside(settings, lines), np.empty(0), grids)
+        found, lines = (found, lines[:0]) if isinstance(again, Correction) else (again, lines)
+    recovery, periods = found.recovery, raw.periods
+    aligned, scatter = _steady(found.average, settings, lines)
+    corrected = _of_orders(found.average, settings)
     amplitudes, unsure, whole = _amplitudes(raw, replace(corrected, amplitudes=aligned), recovery)
     begins = np.flatnonzero(raw.used)
     errors = recovery.expected * settings.cycle_length / np.mean(periods)
@@ -252,25 +254,81 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
         corrected_errors(
             scatter, raw.orders, amplitudes=amplitudes * gain, unsure=unsure, largest=whole * gain,
             jitter=_in_cycles(recovery.std, raw, settings)).over(gain),
-        corrected.parts, recovery.std, refitted,
+        corrected.parts, recovery.std, found.refitted,
         _envelope(corrected, _between(raw, cycles, corrected.pulses), settings))
 
 
-def _steady(average: Average, settings: AverageSettings) -> tuple[ComplexArray, Scatter]:
+@dataclass(frozen=True)
+class _Aligned:
+    """The `average` between the pulses that a `recovery` expects, `refitted` of them displaced."""
+
+    recovery: PulseErrorRecovery
+    refitted: int
+    average: Average
+
+
+def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
+             candidates: FloatArray, grids: LatestGrid) -> _Aligned | Correction:
+    """
+    Recover the pulse errors and average again without them.
+
+    The average has the orders of `candidates`, too, which the recovery does not use. A correction
+    that is not accepted is returned as it is.
+    """
+    recovery, refitted = _refitted(raw, cycles, settings, grids)
+    largest, reach = np.abs(recovery.expected).max(), _REACH * raw.periods.min()
+    reason = recovery.reason if largest <= reach else (
+        f'a pulse error of {largest:.3g} s is above {reach:.3g} s, {_REACH:.0%} of a trigger '
+        'cycle: check the pulses')
+    if reason:
+        return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
+    return _Aligned(recovery, refitted, _average_again(
+        raw, cycles, _beside(settings, candidates), raw.pulses - recovery.expected))
+
+
+def _beside(settings: AverageSettings, lines: FloatArray) -> AverageSettings:
+    """Return settings with `lines` of other shafts behind the orders."""
+    return replace(settings, orders=(*settings.orders, *lines.tolist()))
+
+
+def _of_orders(average: Average, settings: AverageSettings) -> Average:
+    """Return an average of the orders of `settings`, which are its first ones."""
+    count = len(settings.orders)
+    return replace(
+        average, orders=average.orders[:count], amplitudes=average.amplitudes[:, :count],
+        noise=average.noise[:, :count], gains=average.gains[:, :count],
+        cycle_amplitudes=average.cycle_amplitudes[..., :count])
+
+
+def _coherent(average: Average, settings: AverageSettings, candidates: FloatArray) -> FloatArray:
+    """Return the lines among `candidates` that an average without pulse errors still shows."""
+    if not candidates.size:
+        return candidates
+    clean = _resampled(average, average.cycle_amplitudes, _beside(settings, candidates))[1]
+    lines = coherent(candidates, clean[..., len(settings.orders):], settings.cycle_length)
+    while lines.size and not leaks_apart(
+            _beside(settings, lines).orders, settings.cycle_length, len(clean)):
+        lines = lines[:-1]
+    return lines
+
+
+def _steady(average: Average, settings: AverageSettings, lines: FloatArray
+            ) -> tuple[ComplexArray, Scatter]:
     """
     Return the amplitudes (channel, order) of an average without what leaks into its cycles.
 
-    That are the other orders, as far as the cycles keep them apart, and the lines of other shafts.
-    The second result is the scatter of the cycles about them.
+    That are the other orders, as far as the cycles keep them apart, and the `lines` of other
+    shafts. The second result is the scatter of the cycles about them.
     """
-    cycles, clean = _resampled(average, average.cycle_amplitudes, settings)
-    if average.discarded_cycles or not leaks_apart(
-            settings.orders, settings.cycle_length, len(cycles)):
-        return average.amplitudes, Scatter.of(cycles, clean)
-    steady = steady_part(clean, settings.cycle_length * np.asarray(settings.orders))
-    scatter = Scatter.of(steady.cycles, steady.cycles).inflated(steady.inflation, steady.lost)
-    leaked = cycles.mean(axis=0) - steady.mean
-    return average.amplitudes - leaked * (1.0 / average.gain), scatter
+    known, count = _beside(settings, lines), len(settings.orders)
+    average = _of_orders(average, known)
+    cycles, clean = _resampled(average, average.cycle_amplitudes, known)
+    if not average.discarded_cycles and leaks_apart(
+            known.orders, settings.cycle_length, len(cycles)):
+        leaked = cycles.mean(axis=0) - clean.mean(axis=0)
+        average, cycles = replace(
+            average, amplitudes=average.amplitudes - leaked * (1.0 / average.gain)), clean
+    return average.amplitudes[:, :count], Scatter.of(cycles[..., :count], clean[..., :count])
 
 
 def _envelope(average: Average, cycles: Sequence[CycleSamples], settings: AverageSettings

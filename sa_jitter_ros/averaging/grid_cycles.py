@@ -28,6 +28,9 @@ ComplexArray = NDArray[np.complex128]
 
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32
+# Lines of the spectrum of all cycles whose median is the noise of each, how far a line is above it
+# that noise alone makes in one of a million, and the part of the sampling rate with lines.
+_BLOCK, _STANDS_OUT, _BAND = 64, 20.0, 0.4
 # A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
 # of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
 # Lengths of panels are this factor apart, so that fits up to similar orders share them.
@@ -44,6 +47,7 @@ class GridCycles:
     def __init__(self, cycles: FloatArray) -> None:
         self.cycles = np.asarray(cycles, np.float64)
         self._compact: dict[int, FloatArray] = {}
+        self._lines: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     @cached_property
     def samples(self) -> FloatArray:
@@ -74,6 +78,20 @@ class GridCycles:
             spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
         return spectra
 
+    def lines(self, top: float) -> tuple[FloatArray, FloatArray]:
+        """
+        Return the lines up to `top`, or more, that stand out in the spectrum of all cycles.
+
+        They are in cycles in a trigger cycle, below 0.4 of the sampling rate, with their power
+        (line,) over the noise around, of the channel in which they are clearest.
+        """
+        points = self.cycles.shape[1]
+        together = max(number for number in range(1, max(int(_BAND * points / top), 1) + 1)
+                       if points % number == 0)
+        if together not in self._lines:
+            self._lines[together] = _standing_out(self.cycles, together)
+        return self._lines[together]
+
     def compact(self, rows: FloatArray, cycles: float) -> tuple[FloatArray, FloatArray]:
         """
         Return `rows` (sample, column) and samples (sample, cycle and channel) in fewer numbers.
@@ -89,6 +107,25 @@ class GridCycles:
         if length not in self._compact:
             self._compact[length] = _in_panels(flat, length)
         return _in_panels(rows, length), self._compact[length]
+
+
+def _standing_out(cycles: FloatArray, together: int) -> tuple[FloatArray, FloatArray]:
+    """Return the lines that means of so many samples of all `cycles` show (`GridCycles.lines`)."""
+    count, points, channels = cycles.shape
+    flat = cycles.reshape(count * points // together, together, channels).mean(axis=1)
+    window = np.sin(pi * (np.arange(len(flat)) + 0.5) / len(flat)) ** 2
+    spectrum = rfft((flat - flat.mean(axis=0)) * window[:, None], axis=0)
+    power = np.abs(spectrum[:int(_BAND * len(flat))]) ** 2
+    blocks = np.array_split(power, max(len(power) // _BLOCK, 1))
+    floor = np.concatenate([np.broadcast_to(np.median(block, axis=0), block.shape)
+                            for block in blocks])
+    power = np.max(power / np.maximum(floor, np.finfo(float).tiny), axis=1)
+    inside = power[1:-1]
+    place = 1 + np.flatnonzero((inside > power[:-2]) & (inside >= power[2:])
+                               & (inside > _STANDS_OUT))
+    before, here, after = (np.log(power[place + shift]) for shift in (-1, 0, 1))
+    off = 0.5 * (before - after) / (before - 2.0 * here + after)
+    return (place + off) / count, power[place]
 
 
 def cycle_weights(count: int) -> FloatArray:

@@ -1,0 +1,87 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+
+"""
+Lines of other shafts that leak into order amplitudes of a correction.
+
+A line that is no order of the shaft leaks into the amplitudes of all orders of a trigger cycle,
+and turns there from cycle to cycle. A few cycles do not average it out, and it looks like errors
+of the pulses. Where its order is known it is no disturbance: it is fitted, and removed, as the
+orders of the shaft are (`noise.without_leakage`). The lines stand out in the spectrum of all
+cycles; so do those that pulse errors make beside an order, on both of its sides.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# Cycles from which on lines are told from changes of the orders, and most lines.
+_LEAST_CYCLES, _MOST = 8, 16
+# Turns of a line against an order in all cycles from which on it is no slow change of the order.
+_LEAST_TURNS = 2.0
+# The highest line that is looked for, over the highest order.
+_HIGHEST = 2.0
+# What has so much of its power in the mirror image about an order is made by that order.
+_MIRRORED = 0.25
+# Probability that noise alone passes for a line.
+_FALSE_ALARM = 1e-3
+_STEPS = 16  # places between two lines of the spectrum at which the order of a line is refined
+
+
+def other_lines(grid: GridCycles, orders: FloatArray, cycle_length: float) -> FloatArray:
+    """
+    Return the orders of lines that may leak into `orders`, of consecutive trigger cycles.
+
+    `cycle_length` is r. Those that may leak most come first, at most 16.
+    """
+    count = len(grid.cycles)
+    if count < _LEAST_CYCLES or not orders.size:
+        return np.empty(0)
+    lines, power = grid.lines(_HIGHEST * float(orders.max()) * cycle_length)
+    lines, span = lines / cycle_length, count * cycle_length
+    own = np.concatenate((orders, -orders))
+    leaked = power * np.max(np.sinc(cycle_length * np.abs(lines[:, None] - own)) ** 2, axis=1)
+    mirrored = np.abs(2.0 * orders[:, None, None] - lines[:, None] - lines) * span < 1.0
+    alone = ~np.any(mirrored & (power > _MIRRORED * power[:, None]), axis=(0, 2))
+    found = np.empty(0)
+    for line in lines[np.argsort(-leaked)][alone[np.argsort(-leaked)]]:
+        if np.all(np.abs(line - np.append(own, found)) * span >= _LEAST_TURNS):
+            found = np.append(found, line)
+        if found.size == _MOST:
+            break
+    return found
+
+
+def coherent(lines: FloatArray, cycles: ComplexArray, cycle_length: float) -> FloatArray:
+    """
+    Return the orders of those `lines` that pulse errors do not make, of consecutive cycles.
+
+    `cycles` (cycle, channel, line) are their amplitudes in trigger cycles without pulse errors. A
+    line keeps its amplitude from cycle to cycle, and turns by what its order is off.
+    """
+    count, channels, _ = cycles.shape
+    step = np.arange(-_STEPS, _STEPS + 1) / (2.0 * _STEPS * count)
+    waves = np.exp(-2j * np.pi * np.multiply.outer(step, np.arange(count)))
+    sums = np.abs(np.tensordot(waves, cycles, axes=1)) ** 2 / count
+    power = np.sum(sums, axis=1)
+    best = np.clip(np.argmax(power, axis=0), 1, 2 * _STEPS - 1)
+    place = np.arange(lines.size)
+    before, here, after = (power[best + shift, place] for shift in (-1, 0, 1))
+    bend = before - 2.0 * here + after
+    off = np.clip(0.5 * (before - after) / np.where(bend < 0.0, bend, -np.inf), -1.0, 1.0)
+    steady = sums[best, :, place].T
+    scatter = np.maximum(np.sum(np.abs(cycles) ** 2, axis=0) - steady, np.finfo(float).tiny)
+    level = np.expm1(np.log(channels * lines.size / _FALSE_ALARM) / (count - 1.0))
+    clear = np.any(steady > level * scatter, axis=0)
+    return np.asarray(lines + (step[best] + off * (step[1] - step[0])) / cycle_length)[clear]
