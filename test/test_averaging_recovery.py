@@ -29,12 +29,11 @@ def jitter(rng, width, *, count=100, speed=SPEED):
     return rng.uniform(-0.5, 0.5, count + 1) * width / 19.0 / speed
 
 
-def simulate(rng, errors, lines, *, samples=512, ratio=RATIO, noise=0.0, ripple=0.0, angle=0.0):
+def simulate(rng, errors, lines, *, samples=512, ratio=RATIO, noise=0.0, angle=0.0):
     """
     Trigger cycles (cycle, sample, channel) between the wrong pulses, and these pulses.
 
-    `lines` maps orders to the amplitudes of the channels; `noise` is per sample, `ripple` (cycle,)
-    in seconds.
+    `lines` maps orders to the amplitudes of the channels; `noise` is per sample.
     """
     count = len(errors) - 1
     periods = PERIOD * (1.0 + 2e-4 * rng.standard_normal(count + 2))
@@ -42,7 +41,6 @@ def simulate(rng, errors, lines, *, samples=512, ratio=RATIO, noise=0.0, ripple=
     pulses = true[:-1] + errors
     u = np.arange(samples) / samples
     times = pulses[:-1, None] + np.diff(pulses)[:, None] * u
-    times += np.multiply.outer(np.broadcast_to(ripple, count), u * (1.0 - u))
     knots = np.concatenate(([-PERIOD], true))
     turns = angle + ratio * np.interp(times, knots, np.arange(-1.0, count + 2.0))
     cycles = sum(np.real(np.exp(2j * np.pi * order * turns)[:, :, None] * np.asarray(amplitudes))
@@ -317,17 +315,6 @@ def test_an_order_of_another_shaft_is_fitted_where_it_matters(rng, share, fitted
     cycles, pulses = simulate(rng, errors, {**MESH, 38.3: [0.5 * share]}, ratio=1.0, noise=0.01)
     recovery = recover(cycles, pulses, declared=declared(0.1, 1.0 / PERIOD), ratio=1.0)
     assert bool(np.any(np.abs(recovery.orders - 38.3) < 0.01)) == fitted
-
-
-def test_speed_ripple_inside_the_cycle_is_separated_from_pulse_errors(rng):
-    errors = jitter(rng, 0.2)
-    ripple = 4.0 * declared(0.2) * rng.standard_normal(100)
-    cycles, pulses = simulate(rng, errors, MESH, samples=1024, noise=0.1, ripple=ripple)
-    hats = recover(cycles, pulses, declared=declared(0.2))
-    both = recover(cycles, pulses, declared=declared(0.2), with_ripple=True)
-    assert np.corrcoef(both.ripple, ripple)[0, 1] > 0.99
-    assert np.std(both.errors - errors) < 0.2 * np.std(hats.errors - errors)
-    assert np.mean(z_scores(both, errors) ** 2) == pytest.approx(1.0, abs=0.75)
 
 
 @pytest.mark.parametrize('count', [2, 3, 4, 5])

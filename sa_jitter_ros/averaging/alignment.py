@@ -87,7 +87,7 @@ def _in_phase(problem: PulseErrorProblem, fit: PulseErrorFit
     pulse does, their weighted sums (pulse,), and the power (order,) of unit orders.
     """
     model, half = problem.model, len(fit.orders)
-    response = model.response(fit.expected, fit.ripple, problem.chosen)
+    response = model.response(fit.expected, problem.chosen)
     residual = model.coefficients - response.signal @ real_parts(
         least_squares(response.signal, model.coefficients))
     size = 2.0 * np.pi * fit.orders[:, None] * fit.amplitudes * problem.significant

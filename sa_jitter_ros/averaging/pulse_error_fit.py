@@ -14,14 +14,13 @@ Fit of pulse errors to the resampled trigger cycles: model, least squares, uncer
 A trigger cycle that is resampled between two wrong pulses contains the vibration `s` at wrong
 angles,
 
-    x_k(u) = s(theta_k(u) + (1 - u) eps_k + u eps_{k+1} + u (1 - u) ripple_k) + noise,
+    x_k(u) = s(theta_k(u) + (1 - u) eps_k + u eps_{k+1}) + noise,
 
-with `theta_k(u) = first_angle + r (k + u)` (Camerini et al. 2019, Eq. 16; the last term, a speed
-ripple faster than the trigger rate, is not in the paper). Every order of `s` is thus a carrier
-times a factor that varies slowly with `u`: a polynomial, given by its values at a few Gauss nodes.
-Carriers times polynomials are the same in all cycles. One orthonormal basis of them compresses
-every cycle to a short vector, in which white noise remains white and the phase model exact. The
-leakage between orders is part of the model for every cycle length.
+with `theta_k(u) = first_angle + r (k + u)` (Camerini et al. 2019, Eq. 16). Every order of `s` is
+thus a carrier times a factor that varies slowly with `u`: a polynomial, given by its values at a
+few Gauss nodes. Carriers times polynomials are the same in all cycles. One orthonormal basis of
+them compresses every cycle to a short vector, in which white noise remains white and the phase
+model exact. The leakage between orders is part of the model for every cycle length.
 
 Amplitudes, noise, errors and their size are estimated in turn, with the covariance that the errors
 have: amplitudes maximise the likelihood in which the errors are integrated out. Only neighbouring
@@ -87,13 +86,12 @@ class Response:
     Compressed cycles of unit orders: matrices (cycle, dimension, 2 orders) for `real_parts`.
 
     `signal` are the orders, `late` the orders weighted with u, `expected` what uncertain errors
-    leave of the orders in the mean, `middle` the orders weighted with u (1 - u), if asked for.
+    leave of the orders in the mean.
     """
 
     signal: FloatArray
     late: FloatArray
     expected: FloatArray
-    middle: FloatArray
 
 
 @dataclass(frozen=True)
@@ -119,33 +117,29 @@ class CompressedCycles:
         """Return the number of dimensions of each order."""
         return np.diff(np.append(self.blocks, self.coefficients.shape[1]))
 
-    def response(self, errors: FloatArray, ripple: FloatArray,
-                 chosen: Sequence[int] | NDArray[np.intp], *,
-                 covariance: FloatArray | None = None, with_middle: bool = False) -> Response:
+    def response(self, errors: FloatArray, chosen: Sequence[int] | NDArray[np.intp], *,
+                 covariance: FloatArray | None = None) -> Response:
         """
-        Return the response of `chosen` orders to `errors`, `ripple` in fundamental cycles.
+        Return the response of `chosen` orders to `errors` (pulse,) in fundamental cycles.
 
         `covariance` (2, pulse) is that of the errors, with the next in the second row; None: they
         are known.
         """
-        count, half = len(ripple), len(chosen)
-        parts = 3 + with_middle
-        out = np.zeros((parts, count, self.coefficients.shape[1], 2 * half))
+        count, size, _ = self.coefficients.shape
+        half = len(chosen)
+        out = np.zeros((3, count, size, 2 * half))
         for column, i in enumerate(chosen):
             u, mixing = self.nodes[i], self.mixing[i]
             turns = self.start[:, i, None] + self.orders[i] * (
-                np.outer(errors[:-1], 1.0 - u) + np.outer(errors[1:], u)
-                + np.outer(ripple, u * (1.0 - u)))
+                np.outer(errors[:-1], 1.0 - u) + np.outer(errors[1:], u))
             values = np.exp(2j * pi * turns)
             left = 1.0 if covariance is None else np.exp(
                 -2.0 * (pi * self.orders[i]) ** 2 * variance_within(covariance, u))
-            weighted = np.stack((values, values * u, values * left, values * (u * (1.0 - u)))
-                                [:parts])
-            mixed = weighted.reshape(-1, len(u)) @ mixing.T
-            mixed = mixed.reshape(parts, count, len(mixing))
+            weighted = np.stack((values, values * u, values * left))
+            mixed = (weighted.reshape(-1, len(u)) @ mixing.T).reshape(3, count, len(mixing))
             out[:, :, :len(mixing), column] = mixed.real
             out[:, :, :len(mixing), half + column] = -mixed.imag
-        return Response(out[0], out[1], out[2], out[-1])
+        return Response(*out)
 
 
 def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, orders: FloatArray,
@@ -242,9 +236,9 @@ class PulseErrorFit:
 
     `expected` (pulse,) are the errors that vibration and jitter of the size `std` make likeliest,
     `covariance` (2, pulse) their variance and their covariance with the next one. `errors` and
-    `standard_errors` (pulse,) are by the vibration alone. `ripple` (cycle,) is that of the cycles.
-    `evidence` is the logarithm of the likelihood of errors over that of none, `shown` the share of
-    their variance that the vibration shows. `amplitudes` (order, channel) are those without the
+    `standard_errors` (pulse,) are by the vibration alone. `evidence` is the logarithm of the
+    likelihood of errors over that of none, `shown` the share of their variance that the vibration
+    shows. `amplitudes` (order, channel) are those without the
     errors; those between the expected pulses are `aligned` times as large, because they align
     noise and leave errors; NaN where the order is not `significant`. `noise` (order, channel) is
     the standard deviation of the complex amplitude of one cycle. `weight` (dimension, channel) is
@@ -259,7 +253,6 @@ class PulseErrorFit:
     std: float
     evidence: float
     shown: float
-    ripple: FloatArray
     orders: FloatArray
     amplitudes: ComplexArray
     aligned: FloatArray
@@ -279,7 +272,6 @@ class PulseErrorProblem:
     model: CompressedCycles
     chosen: NDArray[np.intp]
     significant: NDArray[np.bool_]
-    with_ripple: bool
 
     def solve(self, errors: FloatArray, *, declared: float) -> PulseErrorFit:
         """
@@ -293,13 +285,11 @@ class PulseErrorProblem:
         """
         model, orders = self.model, self.model.orders[self.chosen]
         count, _, channels = model.coefficients.shape
-        ripple = np.zeros(count)
         share = np.zeros((len(model.orders), channels))
         covariance, std, shown = np.zeros((2, count + 1)), declared, 0.0
         amplitudes = np.zeros((len(orders), channels), np.complex128)
         for number in range(_ITERATIONS):
-            response = model.response(errors, ripple, self.chosen, covariance=covariance,
-                                      with_middle=self.with_ripple)
+            response = model.response(errors, self.chosen, covariance=covariance)
             before, amplitudes = amplitudes, least_squares(
                 response.signal, model.coefficients, response.expected)
             fitted = response.signal @ real_parts(amplitudes)
@@ -312,9 +302,6 @@ class PulseErrorProblem:
             first *= weight
             last *= weight
             residual *= weight
-            if self.with_ripple:  # eliminate the ripple from the equations of its cycle
-                (first, last, residual), parts, size = _without(
-                    response.middle @ slope * weight, (first, last, residual))
             information = Tridiagonal(np.zeros(count + 1), _dot(first, last))
             information.diagonal[:-1] += _dot(first, first)
             information.diagonal[1:] += _dot(last, last)
@@ -325,8 +312,6 @@ class PulseErrorProblem:
                 std = estimated_size(information, information.times(errors) + pull, declared)
             shrunk = information.plus(std**-2)
             step = shrunk.solve(pull - errors * std**-2)
-            if self.with_ripple:
-                ripple = ripple + (parts[2] - parts[0] * step[:-1] - parts[1] * step[1:]) / size
             step -= step.mean()
             errors = errors + step
             covariance = shrunk.covariance()
@@ -349,12 +334,12 @@ class PulseErrorProblem:
                             where=self.significant & (size > 0.0))
         return PulseErrorFit(
             errors, covariance, unshrunk - unshrunk.mean(), np.sqrt(alone.covariance()[0]), std,
-            evidence, shown, ripple, orders, amplitudes, aligned, noise, weight, shrunk)
+            evidence, shown, orders, amplitudes, aligned, noise, weight, shrunk)
 
     def _misfit_without_errors(self, weight: FloatArray) -> float:
         """Return the weighted square of what remains of the cycles without errors of pulses."""
         count = len(self.model.coefficients)
-        signal = self.model.response(np.zeros(count + 1), np.zeros(count), self.chosen).signal
+        signal = self.model.response(np.zeros(count + 1), self.chosen).signal
         fitted = signal @ real_parts(least_squares(signal, self.model.coefficients))
         return float(np.sum((weight * (self.model.coefficients - fitted)) ** 2))
 
@@ -367,7 +352,7 @@ class PulseErrorProblem:
         expected errors.
         """
         model, count = self.model, len(self.model.coefficients)
-        signal = model.response(np.zeros(count + 1), np.zeros(count), self.chosen).signal
+        signal = model.response(np.zeros(count + 1), self.chosen).signal
         amplitudes = least_squares(signal, model.coefficients)
         fitted = signal @ real_parts(amplitudes)
         variance = self._variance(model.coefficients - fitted, fitted, np.zeros(1), 0.0)
@@ -404,7 +389,7 @@ class PulseErrorProblem:
         """
         count, size = len(residual), self.model.sizes[:, None]
         power = np.median(np.add.reduceat(residual**2, self.model.blocks, axis=1), axis=0)
-        free = size - share * (shown + self.with_ripple) - 2.0 / count
+        free = size - share * shown - 2.0 / count
         variance = power / free / (1.0 - 2.0 / (9.0 * free)) ** 3  # median of chi-squared
         # Resampling and model are not exact.
         floor = _FLOOR**2 * np.mean(np.sum(fitted**2, axis=1), axis=0) / size
@@ -498,16 +483,6 @@ def estimated_size(information: Tridiagonal, right: FloatArray, declared: float
                                + (right @ common) ** 2 / delay - np.log(delay))
     chance = np.exp(likelihood - likelihood.max()) * _CHANCES
     return float(np.exp(np.log(sizes) @ chance / chance.sum()))
-
-
-def _without(direction: FloatArray, items: Sequence[FloatArray]
-             ) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
-    """Return items of cycles without their parts along a direction, these, and its length."""
-    size = np.sqrt(_dot(direction, direction))
-    direction = direction / size[:, None, None]
-    parts = [_dot(direction, item) for item in items]
-    left = [item - direction * part[:, None, None] for item, part in zip(items, parts)]
-    return left, parts, size
 
 
 def _occam(information: Tridiagonal, std: float) -> float:

@@ -85,8 +85,7 @@ class PulseErrorRecovery:
     fundamental cycles squared. `orders` are those used; `amplitudes` (channel, order) their
     complex peak amplitudes without the errors, at angle 0; between the expected pulses they are
     `aligned` (channel, order) times as large, NaN where a channel does not show the order; `noise`
-    (channel, order) is the standard deviation of the complex amplitude of one cycle. `ripple`
-    (cycle,) is the factor of u (1 - u) in the error inside a cycle (s), zero unless `with_ripple`.
+    (channel, order) is the standard deviation of the complex amplitude of one cycle.
     `aligned_error` (channel, order) is the standard error of `aligned`, `excess` the mean variance
     of the expected errors inside a cycle beyond that of their covariance, `excess_error` its own.
     """
@@ -105,7 +104,6 @@ class PulseErrorRecovery:
     amplitudes: ComplexArray
     aligned: FloatArray
     noise: FloatArray
-    ripple: FloatArray
     aligned_error: FloatArray
     excess: float
     excess_error: float
@@ -128,7 +126,7 @@ class _Attempt:
 def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length: float,
                          declared_standard_deviation: float, first_angle: float = 0.0,
                          orders: Sequence[float] = (), additional_orders: Sequence[float] = (),
-                         most_orders: int = 12, with_ripple: bool = False) -> PulseErrorRecovery:
+                         most_orders: int = 12) -> PulseErrorRecovery:
     """
     Recover the pulse errors of one average from its vibration.
 
@@ -138,7 +136,6 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     cycles. `declared_standard_deviation` (s) is that of the declared pulse error. `orders` are the
     orders to use; without it, the strongest of the integer and the `additional_orders` are used,
     at most `most_orders` and as many more as there are fractions in `additional_orders`.
-    `with_ripple` also fits a speed ripple u (1 - u) of every cycle.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
     cycle_length or standard deviation that is not positive.
@@ -162,8 +159,7 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     declared = declared_standard_deviation * cycle_length / float(np.mean(periods))
     attempt = partial(
         _staged_fit, grid, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
-        additional_orders=additional_orders, most_orders=most_orders, declared=declared,
-        with_ripple=with_ripple)
+        additional_orders=additional_orders, most_orders=most_orders, declared=declared)
     found = _likeliest(attempt, declared)
     problem, fit, reason = found.problem, found.fit, found.reason
     if problem is not None and fit is not None:
@@ -179,7 +175,7 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
             np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.zeros(count + 1),
             np.zeros((2, count + 1)), np.zeros(count + 1, np.bool_), 0.0, 0.0, 0.0, np.empty(0),
             np.empty((channels, 0), np.complex128), np.empty((channels, 0)),
-            np.empty((channels, 0)), np.zeros(count), np.empty((channels, 0)), 0.0, 0.0)
+            np.empty((channels, 0)), np.empty((channels, 0)), 0.0, 0.0)
 
     expected = fit.expected * float(np.mean(periods)) / cycle_length
     for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
@@ -202,7 +198,7 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
         errors, fit.standard_errors * seconds, not reason, reason, expected, fit.covariance,
         2.0 * np.pi * order * fit.standard_errors < _AMBIGUOUS, fit.std * float(seconds.mean()),
         fit.shown, fit.evidence, fit.orders, fit.amplitudes.T, beside_lines.aligned.T, fit.noise.T,
-        fit.ripple * periods / cycle_length, beside_lines.aligned_error.T, beside_lines.excess,
+        beside_lines.aligned_error.T, beside_lines.excess,
         beside_lines.excess_error)
 
 
@@ -261,7 +257,7 @@ def _refusal(fit: PulseErrorFit, errors: FloatArray, periods: FloatArray, declar
 
 def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                 orders: Sequence[float], additional_orders: Sequence[float], most_orders: int,
-                declared: float, expected: float, with_ripple: bool) -> _Attempt:
+                declared: float, expected: float) -> _Attempt:
     """
     Fit low orders first, then higher ones as the errors become better known.
 
@@ -302,7 +298,7 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         if not len(chosen) or np.array_equal(candidates[chosen], used):
             break
         first, used = problem is None, candidates[chosen]
-        problem = PulseErrorProblem(model, chosen, significant[chosen], with_ripple)
+        problem = PulseErrorProblem(model, chosen, significant[chosen])
         if first and used[-1] * width > _SAFE_TURNS:
             errors = problem.scan(width)
         fit = problem.solve(errors, declared=declared)

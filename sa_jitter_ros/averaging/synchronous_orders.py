@@ -215,7 +215,7 @@ def _deviations(model: CompressedCycles, errors: FloatArray, chosen: NDArray[np.
 
     The deviations (cycle, order, channel) are also given in phase with the amplitudes.
     """
-    signal = model.response(errors, np.zeros(len(model.coefficients)), chosen).signal
+    signal = model.response(errors, chosen).signal
     amplitudes = least_squares(signal, model.coefficients)
     found = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
     return amplitudes, found, (found * np.exp(-1j * np.angle(amplitudes))).real
