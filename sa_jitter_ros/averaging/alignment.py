@@ -61,16 +61,16 @@ class Alignment:
 def alignment(problem: PulseErrorProblem, fit: PulseErrorFit) -> Alignment:
     """Return what the noise beside the lines of a `fit` of a `problem` makes of amplitudes."""
     turned, pull, unit = _in_phase(problem, fit)
-    late = fit.precision.solve(pull)
+    late, begins = fit.precision.solve(pull), problem.model.begins
     late -= late.mean()
-    begin, end = late[:-1], late[1:]
+    begin, end = late[begins], late[begins + 1]
     power = np.maximum(np.abs(fit.amplitudes) ** 2 * unit[:, None], _TINY)
     gained = (begin[:, None, None] * turned[0] + end[:, None, None] * turned[1]) / power
     squares = (begin**2 + begin * end + end**2) / 3.0
     # What the errors are drawn to their mean by costs as much as they are uncertain by it.
     slower = fit.precision.plus(_STEP * fit.std**-2).covariance()
-    drawn = (_mean_square(fit.covariance) - _mean_square(slower)) / _STEP
-    expected = _mean_square(fit.covariance)
+    expected = _mean_square(fit.covariance, begins)
+    drawn = (expected - _mean_square(slower, begins)) / _STEP
     turn = (2.0 * np.pi * fit.orders[:, None]) ** 2
     larger, error = _shrunk(gained - 0.5 * turn * (squares[:, None, None] + drawn + expected))
     excess, excess_error = _shrunk(squares + drawn - expected)
@@ -92,21 +92,25 @@ def _in_phase(problem: PulseErrorProblem, fit: PulseErrorFit
         least_squares(response.signal, model.coefficients))
     size = 2.0 * np.pi * fit.orders[:, None] * fit.amplitudes * problem.significant
     slope, weighted = real_parts(size), residual * fit.weight**2
-    pull = np.zeros(len(residual) + 1)
+    pull = np.zeros(model.pulses)
     turned = []
     for number, unit_orders in enumerate((response.signal - response.late, response.late)):
         both = np.matmul(unit_orders.transpose(0, 2, 1), residual) * slope
         turned.append(both[:, :half] + both[:, half:])
-        pull[number:len(residual) + number] += np.einsum(
+        pull[model.begins + number] += np.einsum(
             'kdc,kdc->k', unit_orders @ slope, weighted)
     unit = np.mean(np.sum(response.signal[:, :, :half] ** 2, axis=1), axis=0)
     return np.array(turned), pull, unit
 
 
-def _mean_square(covariance: FloatArray) -> float:
-    """Return the mean variance inside a cycle of errors of a `covariance` (2, pulse)."""
+def _mean_square(covariance: FloatArray, begins: NDArray[np.int64]) -> float:
+    """
+    Return the mean variance inside a cycle of errors of a `covariance` (2, pulse).
+
+    The cycles begin at the pulses `begins` (cycle,).
+    """
     own, beside = covariance
-    return float(np.mean(own[:-1] + beside[:-1] + own[1:]) / 3.0)
+    return float(np.mean(own[begins] + beside[begins] + own[begins + 1]) / 3.0)
 
 
 def _shrunk(series: FloatArray) -> tuple[FloatArray, FloatArray]:

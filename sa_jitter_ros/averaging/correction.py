@@ -10,9 +10,8 @@
 
 """The corrected average: pulse errors are recovered from the vibration and removed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 import math
 
 import numpy as np
@@ -31,15 +30,12 @@ from sa_jitter_ros.averaging.other_lines import coherent, other_lines
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
-from sa_jitter_ros.pulses.resampling import periodic
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Grid = tuple[FloatArray, GridCycles, NDArray[np.bool_]]
 
 _ROUNDS = 2  # of the search for displaced pulses
-_REPETITIONS = 4  # of the recovery where cycles were discarded
-_FINE = 8  # points of a waveform between two of its own, where it is interpolated
 _REACH = 0.06  # largest correction of a pulse, a fraction of a trigger cycle
 # Largest uncertainty of the phase (rad) of an order by that of the expected errors.
 _UNCERTAIN = 1.0
@@ -67,12 +63,13 @@ class LatestGrid:
         """Free the memory."""
         self._cycles, self._found = [], None
 
-    def of(self, cycles: list[CycleSamples], method: str) -> Grid:
+    def of(self, cycles: list[CycleSamples], method: str, numbers: NDArray[np.int64]) -> Grid:
         """
         Return the grid (cycle, sample, channel) of `cycles`, which are resampled by `method`.
 
-        The second result has those channels only which tell of the pulse errors, as the third
-        (channel,) says; if none does, all.
+        Their `numbers` (cycle,) count from the first one, discarded ones included. The second
+        result has those channels only which tell of the pulse errors, as the third (channel,)
+        says; if none does, all.
         """
         if self._found is None or not self._has(cycles, method):
             grid = cycle_grid(cycles, method=method)
@@ -81,7 +78,7 @@ class LatestGrid:
                 informative[:] = True
             self._method, self._cycles = method, cycles
             seen = grid if informative.all() else grid[..., informative]
-            self._found = grid, GridCycles(seen), informative
+            self._found = grid, GridCycles(seen, numbers), informative
         return self._found
 
     def _has(self, cycles: list[CycleSamples], method: str) -> bool:
@@ -224,11 +221,9 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
     if len(cycles) < 2:
         return _uncorrected(raw, 'pulse errors follow from the difference between trigger cycles '
                                  'and there is one cycle: average more')
-    if raw.discarded_cycles and not np.isfinite(raw.waveform).all():
-        return _uncorrected(raw, 'cycles were discarded, and what is left has no whole '
-                                 'fundamental cycle that tells what they were: average more')
     candidates = np.empty(0) if raw.discarded_cycles else other_lines(
-        grids.of(cycles, settings.interpolation)[1], raw.orders, settings.cycle_length)
+        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1], raw.orders,
+        settings.cycle_length)
     found = _aligned(raw, cycles, settings, candidates, grids)
     if isinstance(found, Correction):
         return found
@@ -358,7 +353,7 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     The second result (channel, order) is the relative standard error that the factors add, the
     third the largest size of the amplitude: that with the whole factor.
     """
-    variance = variance_within(recovery.covariance, _U)
+    variance = variance_within(recovery.covariance, _U, np.flatnonzero(raw.used))
     turn = 2.0 * (np.pi * raw.orders) ** 2
     white = (np.exp(-turn[:, None, None] * variance) @ _U_WEIGHT).mean(axis=1)
     left = np.minimum(white * np.exp(-turn * recovery.excess), 1.0)
@@ -440,16 +435,11 @@ def _recovered(raw: Average, cycles: list[CycleSamples], settings: AverageSettin
                grids: LatestGrid) -> tuple[PulseErrorRecovery, FloatArray]:
     """Recover the errors of the pulses of `raw` from its trigger `cycles`; return both."""
     # The recovery is a model of the linear law, whatever law the settings have.
-    grid, seen, informative = grids.of(cycles, settings.interpolation)
-    recover = partial(
-        recover_pulse_errors, cycle_length=settings.cycle_length, first_angle=raw.first_angle,
-        additional_orders=settings.orders,
+    grid, seen, informative = grids.of(cycles, settings.interpolation, raw.cycle_numbers)
+    found = recover_pulse_errors(
+        seen, periods=raw.periods, cycle_length=settings.cycle_length,
+        first_angle=raw.first_angle, additional_orders=settings.orders,
         declared_standard_deviation=_declared(cycles, settings))
-    if raw.discarded_cycles:
-        found = _recovered_over_gaps(replace(raw, waveform=raw.waveform[informative]), seen.cycles,
-                                     recover, settings.cycle_length)
-    else:
-        found = recover(seen, periods=raw.periods)
     return _of_all_channels(found, informative), grid
 
 
@@ -466,62 +456,6 @@ def _of_all_channels(recovery: PulseErrorRecovery, informative: NDArray[np.bool_
         recovery.noise, recovery.aligned, recovery.aligned_error)
     return replace(recovery, amplitudes=amplitudes, noise=noise, aligned=aligned,
                    aligned_error=error)
-
-
-def _recovered_over_gaps(raw: Average, grid: FloatArray,
-                         recover: Callable[..., PulseErrorRecovery], cycle_length: float
-                         ) -> PulseErrorRecovery:
-    """
-    Recover the errors where trigger cycles between those of `grid` were discarded.
-
-    The recovery takes consecutive cycles. In the place of the discarded ones it gets what the
-    waveform says of them with the pulse errors on either side. These count half from there: they
-    are found by repetition, so that the made-up cycles tell nothing in the end.
-    """
-    numbers = raw.cycle_numbers
-    every = np.arange(numbers[-1] + 1)
-    lost = np.setdiff1d(every, numbers)
-    periods = np.interp(every, numbers, raw.periods)
-    periods[numbers] = raw.periods
-    whole = np.empty((every.size, *grid.shape[1:]))
-    whole[numbers] = grid
-    known = np.zeros(every.size + 1, np.bool_)
-    known[numbers] = known[numbers + 1] = True
-    pulses = np.flatnonzero(known)
-    errors = np.zeros(every.size + 1)
-    beside = np.zeros(every.size + 1, np.bool_)
-    beside[lost] = beside[lost + 1] = True
-    beside &= known
-    to_cycles = cycle_length / float(np.mean(raw.periods))
-    for _ in range(_REPETITIONS):
-        whole[lost] = _expected_cycles(raw, lost, grid.shape[1], cycle_length, errors * to_cycles)
-        recovery = recover(GridCycles(whole), periods=periods)
-        if not recovery.accepted:
-            break
-        errors[beside] = 2.0 * recovery.errors[beside] - errors[beside]
-        errors[~known] = np.interp(np.flatnonzero(~known), np.flatnonzero(beside), errors[beside])
-    half = np.where(beside[pulses], 2.0, 1.0)
-    found, expected = recovery.errors[pulses], recovery.expected[pulses]
-    return replace(
-        recovery, errors=found - found.mean(), expected=expected - expected.mean(),
-        standard_errors=recovery.standard_errors[pulses] * np.sqrt(half),
-        resolved=recovery.resolved[pulses], covariance=recovery.covariance[:, pulses] * half)
-
-
-def _expected_cycles(raw: Average, numbers: NDArray[np.int64], samples: int, cycle_length: float,
-                     errors: FloatArray) -> FloatArray:
-    """
-    Return what the waveform says of cycles of these numbers, (cycle, sample, channel).
-
-    `errors` (pulse,) are those of all pulses in fundamental cycles.
-    """
-    fine = periodic(raw.waveform, _FINE * raw.waveform.shape[1])
-    u = np.arange(samples) / samples
-    turns = (raw.first_angle + cycle_length * (numbers[:, None] + u)
-             + errors[numbers, None] * (1.0 - u) + errors[numbers + 1, None] * u)
-    points = np.arange(fine.shape[1] + 1) / fine.shape[1]
-    return np.stack([np.interp(np.mod(turns, 1.0), points, np.append(row, row[0]))
-                     for row in fine], axis=-1)
 
 
 def _mean_phasor(orders: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:

@@ -41,13 +41,24 @@ class GridCycles:
     """
     Trigger cycles at equal steps of angle, `cycles`, as (cycle, sample, channel).
 
-    What is kept of them depends on no shaft.
+    They are numbers `numbers` (cycle,) from the first on, those of consecutive cycles if None; at
+    a gap one cycle ends with a pulse and the next begins with another. `begins` (cycle,) are the
+    places, among all `pulses`, of those with which the cycles begin. What is kept of them depends
+    on no shaft.
     """
 
-    def __init__(self, cycles: FloatArray) -> None:
+    def __init__(self, cycles: FloatArray, numbers: NDArray[np.int64] | None = None) -> None:
         self.cycles = np.asarray(cycles, np.float64)
+        self.numbers = np.arange(len(self.cycles)) if numbers is None else numbers
+        self.begins = np.arange(len(self.cycles))
+        self.begins[1:] += np.cumsum(np.diff(self.numbers) > 1)
         self._compact: dict[int, FloatArray] = {}
         self._lines: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+    @property
+    def pulses(self) -> int:
+        """Return the number of pulses between which the cycles lie."""
+        return int(self.begins[-1]) + 2
 
     @cached_property
     def samples(self) -> FloatArray:

@@ -102,7 +102,8 @@ class CompressedCycles:
     `coefficients` (cycle, dimension, channel); `blocks` (order,) is the first dimension that was
     added for an order. The real part of `mixing[i]` (dimension, node) times the complex values of
     order i at its `nodes[i]` are coefficients; `start` (cycle, order) are the angles of the orders
-    at the start of the cycles, in turns.
+    at the start of the cycles, in turns. `numbers` (cycle,) and `begins` (cycle,) are those of
+    `GridCycles`.
     """
 
     coefficients: FloatArray
@@ -111,6 +112,13 @@ class CompressedCycles:
     nodes: tuple[FloatArray, ...]
     mixing: tuple[ComplexArray, ...]
     start: FloatArray
+    numbers: NDArray[np.int64]
+    begins: NDArray[np.int64]
+
+    @property
+    def pulses(self) -> int:
+        """Return the number of pulses between which the cycles lie."""
+        return int(self.begins[-1]) + 2
 
     @property
     def sizes(self) -> NDArray[np.intp]:
@@ -126,15 +134,15 @@ class CompressedCycles:
         are known.
         """
         count, size, _ = self.coefficients.shape
-        half = len(chosen)
+        half, first, last = len(chosen), errors[self.begins], errors[self.begins + 1]
         out = np.zeros((3, count, size, 2 * half))
         for column, i in enumerate(chosen):
             u, mixing = self.nodes[i], self.mixing[i]
             turns = self.start[:, i, None] + self.orders[i] * (
-                np.outer(errors[:-1], 1.0 - u) + np.outer(errors[1:], u))
+                np.outer(first, 1.0 - u) + np.outer(last, u))
             values = np.exp(2j * pi * turns)
             left = 1.0 if covariance is None else np.exp(
-                -2.0 * (pi * self.orders[i]) ** 2 * variance_within(covariance, u))
+                -2.0 * (pi * self.orders[i]) ** 2 * variance_within(covariance, u, self.begins))
             weighted = np.stack((values, values * u, values * left))
             mixed = (weighted.reshape(-1, len(u)) @ mixing.T).reshape(3, count, len(mixing))
             out[:, :, :len(mixing), column] = mixed.real
@@ -167,9 +175,10 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
     mixing = tuple(triangle[:end, end - 2 * w:end - w] - 1j * triangle[:end, end - w:end]
                    for end, w in zip(ends, widths))
     coefficients = inside.reshape(-1, count, channels)
-    start = np.multiply.outer(first_angle + cycle_length * np.arange(count), orders) % 1.0
+    start = np.multiply.outer(first_angle + cycle_length * grid.numbers, orders) % 1.0
     return CompressedCycles(np.ascontiguousarray(coefficients.transpose(1, 0, 2)), orders,
-                            ends - 2 * widths, tuple(nodes), mixing, start)
+                            ends - 2 * widths, tuple(nodes), mixing, start, grid.numbers,
+                            grid.begins)
 
 
 def _orthonormal(rows: FloatArray, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -200,9 +209,14 @@ def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
     return 0.5 + 0.5 * x, (legendre.legvander(2.0 * u - 1.0, count - 1) * sizes) @ at_nodes.T
 
 
-def variance_within(covariance: FloatArray, u: FloatArray) -> FloatArray:
-    """Return the variance (cycle, u) of the error between pulses of a `covariance` (2, pulse)."""
-    first, both, last = covariance[0, :-1, None], covariance[1, :-1, None], covariance[0, 1:, None]
+def variance_within(covariance: FloatArray, u: FloatArray, begins: NDArray[np.int64]
+                    ) -> FloatArray:
+    """
+    Return the variance (cycle, u) of the error between pulses of a `covariance` (2, pulse).
+
+    The cycles begin at the pulses `begins` (cycle,).
+    """
+    (first, both), last = covariance[:, begins, None], covariance[0, begins + 1, None]
     return np.asarray((1.0 - u) ** 2 * first + 2.0 * u * (1.0 - u) * both + u**2 * last)
 
 
@@ -284,9 +298,9 @@ class PulseErrorProblem:
         standard deviation of the errors; their size is estimated with them (`estimated_size`).
         """
         model, orders = self.model, self.model.orders[self.chosen]
-        count, _, channels = model.coefficients.shape
+        channels, begins = model.coefficients.shape[2], model.begins
         share = np.zeros((len(model.orders), channels))
-        covariance, std, shown = np.zeros((2, count + 1)), declared, 0.0
+        covariance, std, shown = np.zeros((2, model.pulses)), declared, 0.0
         amplitudes = np.zeros((len(orders), channels), np.complex128)
         for number in range(_ITERATIONS):
             response = model.response(errors, self.chosen, covariance=covariance)
@@ -302,12 +316,13 @@ class PulseErrorProblem:
             first *= weight
             last *= weight
             residual *= weight
-            information = Tridiagonal(np.zeros(count + 1), _dot(first, last))
-            information.diagonal[:-1] += _dot(first, first)
-            information.diagonal[1:] += _dot(last, last)
-            pull = np.zeros(count + 1)
-            pull[:-1] += _dot(first, residual)
-            pull[1:] += _dot(last, residual)
+            information = Tridiagonal(np.zeros(model.pulses), np.zeros(model.pulses - 1))
+            information.diagonal[begins] += _dot(first, first)
+            information.diagonal[begins + 1] += _dot(last, last)
+            information.off_diagonal[begins] = _dot(first, last)
+            pull = np.zeros(model.pulses)
+            pull[begins] += _dot(first, residual)
+            pull[begins + 1] += _dot(last, residual)
             if number < _SIZE_ITERATIONS:
                 std = estimated_size(information, information.times(errors) + pull, declared)
             shrunk = information.plus(std**-2)
@@ -338,8 +353,7 @@ class PulseErrorProblem:
 
     def _misfit_without_errors(self, weight: FloatArray) -> float:
         """Return the weighted square of what remains of the cycles without errors of pulses."""
-        count = len(self.model.coefficients)
-        signal = self.model.response(np.zeros(count + 1), self.chosen).signal
+        signal = self.model.response(np.zeros(self.model.pulses), self.chosen).signal
         fitted = signal @ real_parts(least_squares(signal, self.model.coefficients))
         return float(np.sum((weight * (self.model.coefficients - fitted)) ** 2))
 
@@ -352,7 +366,7 @@ class PulseErrorProblem:
         expected errors.
         """
         model, count = self.model, len(self.model.coefficients)
-        signal = model.response(np.zeros(count + 1), self.chosen).signal
+        signal = model.response(np.zeros(model.pulses), self.chosen).signal
         amplitudes = least_squares(signal, model.coefficients)
         fitted = signal @ real_parts(amplitudes)
         variance = self._variance(model.coefficients - fitted, fitted, np.zeros(1), 0.0)
@@ -367,14 +381,16 @@ class PulseErrorProblem:
             shape = np.exp(2j * pi * model.orders[i] * turns) @ model.mixing[i].T
             match = (weighted[:, :shape.shape[1]] @ amplitude).T
             score += (shape @ (match * np.exp(2j * pi * model.start[:, i]))).real
-        table = score.reshape(len(levels), len(levels), count)
-        total, before = np.zeros(len(levels)), np.empty((count, len(levels)), np.intp)
-        for k in range(count):
+        steps = model.pulses - 1
+        table = np.zeros((len(levels), len(levels), steps))
+        table[:, :, model.begins] = score.reshape(len(levels), len(levels), count)
+        total, before = np.zeros(len(levels)), np.empty((steps, len(levels)), np.intp)
+        for k in range(steps):
             arriving = total[:, None] + table[:, :, k]
             before[k] = arriving.argmax(axis=0)
             total = arriving.max(axis=0)
         path = [int(total.argmax())]
-        for k in reversed(range(count)):
+        for k in reversed(range(steps)):
             path.append(int(before[k, path[-1]]))
         return np.asarray(levels[path[::-1]])
 

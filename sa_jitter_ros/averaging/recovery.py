@@ -170,22 +170,26 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
             if again.fit is not None:
                 problem, fit = again.problem, again.fit
     if problem is None or fit is None:
-        count, _, channels = grid.cycles.shape
+        count, channels = grid.pulses, grid.cycles.shape[2]
         return PulseErrorRecovery(
-            np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.zeros(count + 1),
-            np.zeros((2, count + 1)), np.zeros(count + 1, np.bool_), 0.0, 0.0, 0.0, np.empty(0),
+            np.zeros(count), np.full(count, np.nan), False, reason, np.zeros(count),
+            np.zeros((2, count)), np.zeros(count, np.bool_), 0.0, 0.0, 0.0, np.empty(0),
             np.empty((channels, 0), np.complex128), np.empty((channels, 0)),
             np.empty((channels, 0)), np.empty((channels, 0)), 0.0, 0.0)
 
     expected = fit.expected * float(np.mean(periods)) / cycle_length
+    begins, ends = grid.begins, grid.begins + 1
+    cycles = np.bincount(begins, minlength=grid.pulses) + np.bincount(ends)  # beside a pulse
     for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
-        seconds = np.convolve(periods - np.diff(expected), (0.5, 0.5)) / cycle_length
-        seconds[[0, -1]] *= 2.0
+        corrected = periods - (expected[ends] - expected[begins])
+        seconds = (np.bincount(begins, corrected, grid.pulses)
+                   + np.bincount(ends, corrected)) / cycles / cycle_length
         expected = fit.expected * seconds
     expected -= expected.mean()
     errors = fit.errors * seconds
     errors -= errors.mean()
-    reason = _refusal(fit, expected, periods, declared_standard_deviation,
+    reason = _refusal(fit, expected, expected[ends] - expected[begins] >= periods,
+                      declared_standard_deviation,
                       LineSearch.of(grid, cycle_length).gain(fit.expected, found.clear))
     if reason:
         errors, expected = np.zeros_like(errors), np.zeros_like(errors)
@@ -234,18 +238,22 @@ def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, dec
     return periods
 
 
-def _refusal(fit: PulseErrorFit, errors: FloatArray, periods: FloatArray, declared: float,
+def _refusal(fit: PulseErrorFit, errors: FloatArray, turned: NDArray[np.bool_], declared: float,
              gain: float) -> str:
-    """Return why expected errors must not be used for a correction, '' if they can be used."""
+    """
+    Return why expected errors must not be used for a correction, '' if they can be used.
+
+    They turn the pulses of some cycles (cycle,) around.
+    """
     if not fit.shown > _LEAST_SHOWN:
         return (f'the vibration shows {fit.shown:.1%} of the variance of the pulse errors, not '
                 f'more than {_LEAST_SHOWN:.0%}: use stronger orders or a quieter channel')
     largest = float(np.max(np.abs(errors)))
-    if len(periods) < _FEW_CYCLES and largest > _FAR * declared:
+    if len(turned) < _FEW_CYCLES and largest > _FAR * declared:
         return (f'a recovered error of {largest:.3g} s is more than {_FAR:g} times the declared '
-                f'jitter, {declared:.3g} s: in {len(periods)} trigger cycles an order of another '
+                f'jitter, {declared:.3g} s: in {len(turned)} trigger cycles an order of another '
                 'shaft can look like that; average more trigger cycles, or check the pulses')
-    if np.any(np.diff(errors) >= periods):
+    if turned.any():
         return ('a recovered error is larger than a trigger cycle: check ratio, '
                 'pulses_per_revolution and the pulses')
     if gain < 1.0 - _LOSS:
@@ -264,7 +272,7 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
     `declared` is the standard deviation of the errors that is likeliest beforehand, `expected`
     the one whose turns of the orders decide which are safe to use.
     """
-    samples, count = grid.samples, len(grid.cycles)
+    samples = grid.samples
     given = np.unique([g for g in orders if 0.0 < g * cycle_length <= 0.5 * len(samples)])
     search = None if len(orders) else LineSearch.of(grid, cycle_length, additional_orders)
     most = most_orders + sum(g != round(g) for g in set(additional_orders))
@@ -272,7 +280,7 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
     known = given if search is None else search.orders
     width = _UNIFORM_WIDTH * expected  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
-    errors, used, clear = np.zeros(count + 1), np.empty(0), np.empty(0)
+    errors, used, clear = np.zeros(grid.pulses), np.empty(0), np.empty(0)
     problem = None
     for _ in range(_STAGES):
         reach = _MOST_TURNS / width
@@ -282,7 +290,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
             candidates, clearest = search.strongest(errors, most, below=reach)
             clear = np.union1d(clear, clearest)
             if clearest.size:
-                candidates = candidates[search.plausible(errors, candidates, cycles=count)]
+                candidates = candidates[search.plausible(errors, candidates,
+                                                          cycles=len(grid.cycles))]
         # at most half as many unknowns as a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])
@@ -305,7 +314,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         errors = fit.expected
         complete = search is not None and known[-1] * width <= _SAFE_TURNS
         width = min(width, _CERTAIN * float(np.sqrt(np.max(fit.covariance[0]))))
-        spread = max(1.2 * float(np.max(np.abs(np.diff(errors)))), width)
+        spread = max(1.2 * float(np.max(np.abs(
+            errors[grid.begins + 1] - errors[grid.begins]))), width)
         if complete:
             break
     if problem is None:

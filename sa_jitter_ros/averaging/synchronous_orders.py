@@ -31,12 +31,13 @@ from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, PulseErrorProblem,
                                                      real_parts)
-from scipy.fft import rfft
+from scipy.fft import fft, rfft
 from scipy.ndimage import median_filter
 from scipy.special import betainc
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
 
 # Probability that noise alone passes as a synchronous order in any of the orders and channels.
 _FALSE_ALARM = 1e-3
@@ -59,7 +60,7 @@ _TOGETHER, _APART = 2, 0.02
 @dataclass(frozen=True)
 class LineSearch:
     """
-    Spectra (line, cycle, channel) of some consecutive cycles from `first` on (`GridCycles`).
+    Spectra (line, cycle, channel) of some cycles with their `numbers` and `begins` (`GridCycles`).
 
     `orders` are the integer and the additional ones below 0.4 of the sampling rate.
     """
@@ -67,7 +68,8 @@ class LineSearch:
     spectra: ComplexArray
     orders: FloatArray
     cycle_length: float
-    first: int
+    numbers: IntArray
+    begins: IntArray
 
     @classmethod
     def of(cls, grid: GridCycles, cycle_length: float, additional_orders: Sequence[float] = ()
@@ -80,7 +82,8 @@ class LineSearch:
         top = 0.4 * grid.cycles.shape[1] / cycle_length
         others = [g for g in additional_orders if 0.0 < g <= top]
         orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
-        return cls(grid.spectra, orders, cycle_length, grid.first)
+        used = slice(grid.first, grid.first + grid.spectra.shape[1])
+        return cls(grid.spectra, orders, cycle_length, grid.numbers[used], grid.begins[used])
 
     def strongest(self, errors: FloatArray, most: int, *, below: float
                   ) -> tuple[FloatArray, FloatArray]:
@@ -133,8 +136,7 @@ class LineSearch:
     def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
         """Return what (row) orders show of unit lines at each order (column)."""
         count = self.spectra.shape[1]
-        start = self.cycle_length * (self.first + np.arange(count)) + errors[
-            self.first:self.first + count]
+        start = self.cycle_length * self.numbers + errors[self.begins]
         apart = g - g[:, None]
         turns = np.exp(2j * pi * np.multiply.outer(apart, start)) @ cycle_weights(count)
         x = apart * self.cycle_length
@@ -169,10 +171,10 @@ class LineSearch:
                ) -> Iterator[tuple[ComplexArray, ComplexArray]]:
         """Yield weights (bin, cycle) and bins (bin, cycle, channel) around each order."""
         lines, count, _ = self.spectra.shape
-        errors = errors[self.first:self.first + count + 1]
-        angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
+        angle = self.cycle_length * self.numbers + errors[self.begins]
+        longer = errors[self.begins + 1] - errors[self.begins]
         nearest = np.rint(g * self.cycle_length).astype(np.intp)
-        x = np.outer(g, self.cycle_length + np.diff(errors)) - nearest[:, None]
+        x = np.outer(g, self.cycle_length + longer) - nearest[:, None]
         x[np.abs(x - np.rint(x)) < _POLE] += 2.0 * _POLE
         # Hann's lobe 0.5 sin(pi x) / (pi x (1 - x^2)) times exp(-j pi x): the signs that an offset
         # gives to both cancel.
@@ -231,18 +233,25 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
     that are left of each order, in the channels where it is significant. Whole turns and the sign
     of the rate do not show: of the largest tone, the four nearest orders are returned.
     """
-    model, chosen = problem.model, problem.chosen
-    count, orders = len(model.coefficients), model.orders[chosen]
+    model, chosen, numbers = problem.model, problem.chosen, problem.model.numbers
+    count, orders = len(numbers), model.orders[chosen]
     if count < _LEAST_CYCLES:
         return np.empty(0)
+    span = int(numbers[-1]) + 1
     amplitudes, _, lengths = _deviations(model, errors, chosen)
-    rates = np.arange(1, 2 * count) / (4.0 * count)  # a quarter of a turn of all cycles apart
+    rates = np.arange(1, 2 * span) / (4.0 * span)  # a quarter of a turn of all cycles apart
+    there = np.zeros(span)
+    there[numbers] = 1.0
+    sums = fft(there, 4 * span)
+    turning = sums[1:2 * span], sums[2:4 * span:2]
     level, largest, found = _FALSE_ALARM / (count * orders.size), 0.0, np.empty(0)
     for order, told, series, size in zip(orders, problem.significant,
                                          lengths.transpose(1, 0, 2), np.abs(amplitudes)):
         series, channels = series[:, told], int(told.sum())
         series = series - series.mean(axis=0)
-        shares = _shares(series, rates, rfft(series, 4 * count, axis=0)[1:-1])
+        whole = np.zeros((span, channels))
+        whole[numbers] = series
+        shares = _shares(series, turning, rfft(whole, 4 * span, axis=0)[1:-1])
         place = int(np.argmax(shares))
         power = shares[place] * np.sum(series**2)
         # of 2 and count - 3 degrees of freedom in each channel
@@ -251,8 +260,9 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
         if chance < level and power > max(largest, least):
             near = rates[place] + np.linspace(-1.0, 1.0, 21) * rates[0]
             near = near[(near > 0.5 * rates[0]) & (near < 0.5 - 0.5 * rates[0])]
-            waves = np.exp(-2j * pi * np.multiply.outer(near, np.arange(count)))
-            rate = near[int(np.argmax(_shares(series, near, waves @ series)))]
+            waves = np.exp(-2j * pi * np.multiply.outer(near, numbers))
+            both = waves.sum(axis=1), (waves**2).sum(axis=1)
+            rate = near[int(np.argmax(_shares(series, both, waves @ series)))]
             if rate > 0.5 - rates[0]:  # the cycles do not tell it from half a turn
                 rate = 0.5
             largest = power
@@ -260,25 +270,20 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
     return found
 
 
-def _shares(series: FloatArray, rates: FloatArray, lines: ComplexArray) -> FloatArray:
+def _shares(series: FloatArray, turning: tuple[ComplexArray, ComplexArray], lines: ComplexArray
+            ) -> FloatArray:
     """
     Return the share (rate,) of `series` (cycle, channel) that tones have, all channels alike.
 
-    The series have no mean; `lines` (rate, channel) are their Fourier sums at these `rates` (turns
-    a cycle). A tone is any sum of a cosine and a sine without their means.
+    The series have no mean; `lines` (rate, channel) are their Fourier sums, `turning` those of 1,
+    at the same rates and at twice these. A tone is any sum of a cosine and a sine without their
+    means.
     """
-    count = len(series)
-
-    def geometric(rate: FloatArray) -> ComplexArray:
-        """Return the sum of exp(j 2 pi rate k) over the cycles k."""
-        return np.asarray(np.exp(1j * pi * rate * (count - 1)) * np.sin(pi * rate * count)
-                          / np.sin(pi * rate))
-
-    once, twice = geometric(rates), geometric(2.0 * rates)
+    count, (once, twice) = len(series), turning
     cosines = 0.5 * (count + twice.real) - once.real**2 / count
     sines = 0.5 * (count - twice.real) - once.imag**2 / count
     both = 0.5 * twice.imag - once.real * once.imag / count
-    along, across = lines.real, -lines.imag
+    along, across = lines.real, lines.imag
     power = (sines[:, None] * along**2 + cosines[:, None] * across**2
              - 2.0 * both[:, None] * along * across) / (cosines * sines - both**2)[:, None]
     whole = np.maximum(np.sum(series**2, axis=0), np.finfo(float).tiny)
