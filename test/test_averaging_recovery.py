@@ -10,11 +10,13 @@
 
 """Pulse errors recovered from simulated vibration, whose truth is known."""
 
+from itertools import pairwise, product
+
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
-from sa_jitter_ros.averaging.pulse_error_fit import (
-    _CHANCES, _SIZES, estimated_size, Tridiagonal)
+from sa_jitter_ros.averaging.pulse_chain import shortest_path, Tridiagonal
+from sa_jitter_ros.averaging.pulse_error_fit import _CHANCES, _SIZES, estimated_size
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
 from sa_jitter_ros.errors import ParameterError, SignalError
 from scipy.signal import lfilter
@@ -229,6 +231,20 @@ def test_restricted_likelihood_leaves_out_the_delay_of_all_pulses(rng):
     exact = centred @ np.linalg.inv(dense) @ centred
     np.testing.assert_allclose(variance[0], np.diag(exact))
     np.testing.assert_allclose(variance[1, :-1], np.diag(exact, 1))
+
+
+def test_the_shortest_path_is_that_of_all_paths(rng):
+    costs = [rng.uniform(size=n) for n in (2, 3, 1, 4)]
+    steps = [rng.uniform(size=(a.size, b.size)) for a, b in pairwise(costs)]
+
+    def cost(path):
+        return sum(row[i] for row, i in zip(costs, path)) + sum(
+            step[i, j] for step, (i, j) in zip(steps, pairwise(path)))
+
+    best = min(product(*(range(row.size) for row in costs)), key=cost)
+    path, found = shortest_path(costs, steps)
+    assert tuple(path) == best
+    assert found == pytest.approx(cost(best))
 
 
 def test_noise_channels_and_constant_channels_add_nothing(rng):

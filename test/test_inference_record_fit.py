@@ -11,7 +11,6 @@
 """Pulse errors and lines of whole recordings, against the truth of another simulator."""
 
 from functools import cache
-from itertools import pairwise, product
 
 from independent_effects import draw_case
 import numpy as np
@@ -19,7 +18,6 @@ import pytest
 import record_recovery
 from sa_jitter_ros.inference.cycle_states import independent_power
 from sa_jitter_ros.inference.record_fit import OpenRecord
-from sa_jitter_ros.inference.slips import shortest_path
 
 fitted = cache(record_recovery.fitted)
 
@@ -208,20 +206,6 @@ def test_errors_of_more_than_half_a_turn_are_found(rng, memory):
     assert np.abs(z).max() < 6.0
     assert found.orders.size == 3
     assert found.tones.size == 0
-
-
-def test_the_shortest_path_is_that_of_all_paths(rng):
-    costs = [rng.uniform(size=n) for n in (2, 3, 1, 4)]
-    steps = [rng.uniform(size=(a.size, b.size)) for a, b in pairwise(costs)]
-
-    def cost(path):
-        return sum(row[i] for row, i in zip(costs, path)) + sum(
-            step[i, j] for step, (i, j) in zip(steps, pairwise(path)))
-
-    best = min(product(*(range(row.size) for row in costs)), key=cost)
-    path, found = shortest_path(costs, steps)
-    assert tuple(path) == best
-    assert found == pytest.approx(cost(best))
 
 
 def foreign_shaft(rng, *, varying):

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
+from sa_jitter_ros.averaging.pulse_chain import shortest_path, Tridiagonal
 from scipy.linalg import lapack, qr, solve_triangular
 
 FloatArray = NDArray[np.float64]
@@ -272,7 +273,7 @@ class PulseErrorFit:
     aligned: FloatArray
     noise: FloatArray
     weight: FloatArray
-    precision: 'Tridiagonal'
+    precision: Tridiagonal
 
 
 @dataclass(frozen=True)
@@ -361,8 +362,7 @@ class PulseErrorProblem:
         """
         Return the errors on a grid that fit the cycles best, even over several turns of an order.
 
-        Only neighbouring pulses have a cycle in common, so that dynamic programming finds the best
-        of all sequences. Gauss-Newton then starts near the global optimum. `width` is that of the
+        Gauss-Newton then starts near the global optimum. `width` is that of the
         expected errors.
         """
         model, count = self.model, len(self.model.coefficients)
@@ -381,18 +381,10 @@ class PulseErrorProblem:
             shape = np.exp(2j * pi * model.orders[i] * turns) @ model.mixing[i].T
             match = (weighted[:, :shape.shape[1]] @ amplitude).T
             score += (shape @ (match * np.exp(2j * pi * model.start[:, i]))).real
-        steps = model.pulses - 1
-        table = np.zeros((len(levels), len(levels), steps))
-        table[:, :, model.begins] = score.reshape(len(levels), len(levels), count)
-        total, before = np.zeros(len(levels)), np.empty((steps, len(levels)), np.intp)
-        for k in range(steps):
-            arriving = total[:, None] + table[:, :, k]
-            before[k] = arriving.argmax(axis=0)
-            total = arriving.max(axis=0)
-        path = [int(total.argmax())]
-        for k in reversed(range(steps)):
-            path.append(int(before[k, path[-1]]))
-        return np.asarray(levels[path[::-1]])
+        misfit = np.zeros((model.pulses - 1, len(levels), len(levels)))
+        misfit[model.begins] = -np.moveaxis(score.reshape(*misfit.shape[1:], count), 2, 0)
+        path, _ = shortest_path([*np.zeros((model.pulses, len(levels)))], [*misfit])
+        return np.asarray(levels[path])
 
     def _variance(self, residual: FloatArray, fitted: FloatArray, share: FloatArray,
                   shown: float) -> FloatArray:
@@ -415,61 +407,6 @@ class PulseErrorProblem:
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the inner product in every cycle."""
     return np.asarray(np.einsum('kdc,kdc->k', a, b))
-
-
-@dataclass(frozen=True)
-class Tridiagonal:
-    """
-    A symmetric positive definite tridiagonal matrix.
-
-    >>> matrix = Tridiagonal(np.array([2.0, 3.0, 2.0]), np.array([-1.0, -1.0]))
-    >>> matrix.times(matrix.solve(np.array([1.0, 2.0, 4.0]))).round(9)
-    array([1., 2., 4.])
-    """
-
-    diagonal: FloatArray
-    off_diagonal: FloatArray
-
-    def plus(self, value: float) -> 'Tridiagonal':
-        """Return the matrix with a value added to the diagonal."""
-        return Tridiagonal(self.diagonal + value, self.off_diagonal)
-
-    def times(self, vector: FloatArray) -> FloatArray:
-        """Return the product with a vector."""
-        product = self.diagonal * vector
-        product[:-1] += self.off_diagonal * vector[1:]
-        product[1:] += self.off_diagonal * vector[:-1]
-        return np.asarray(product)
-
-    def pivots(self) -> tuple[FloatArray, FloatArray]:
-        """Return the diagonal and the multipliers of the factors L D L'."""
-        pivots, multipliers, fault = lapack.dpttrf(self.diagonal, self.off_diagonal)
-        if fault:
-            raise np.linalg.LinAlgError('the normal matrix of the pulse errors is not positive '
-                                        'definite')
-        return pivots, multipliers
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solution for one right-hand side (n,) or several (n, k)."""
-        return np.asarray(lapack.dpttrs(*self.pivots(), right)[0].reshape(right.shape))
-
-    def covariance(self) -> FloatArray:
-        """
-        Return variances and covariances with the next (2, n) of normal variables of mean 0.
-
-        The matrix is their information; that their mean is 0 is known besides.
-        """
-        count = len(self.diagonal)
-        down, multipliers = self.pivots()
-        up = Tridiagonal(self.diagonal[::-1], self.off_diagonal[::-1]).pivots()[0][::-1]
-        found = np.zeros((2, count))
-        found[0] = 1.0 / (down + up - self.diagonal)
-        found[1, :-1] = -multipliers * found[0, 1:]
-        common = self.solve(np.ones(count))
-        mean = common.sum() / count**2
-        found[0] += mean - 2.0 * common / count
-        found[1, :-1] += mean - (common[:-1] + common[1:]) / count
-        return found
 
 
 def estimated_size(information: Tridiagonal, right: FloatArray, declared: float

@@ -11,11 +11,11 @@
 """The normal equations of the record fit: cycles in a band, amplitudes of lines beside it."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from sa_jitter_ros.averaging.pulse_chain import Tridiagonal
+from scipy.linalg import cho_factor, cho_solve
 
 Array = NDArray[np.float64]
 
@@ -26,8 +26,8 @@ class Solved:
     The normal equations of a step, solved; states and right-hand sides times `scale`.
 
     Bends and gain of a cycle meet those of others only through the errors of its two pulses. So
-    they are eliminated cycle by cycle, and what is left of the states is a tridiagonal matrix of
-    the errors, of which `factor` is the Cholesky factor. `root` (pulse, rest, rest) is the inverse
+    they are eliminated cycle by cycle, and what is left of the states is a tridiagonal matrix
+    `errors` of the errors. `root` (pulse, rest, rest) is the inverse
     Cholesky factor of bends and gain, `through` (pulse, rest, 2) how they follow the errors of
     the two pulses, `border` (pulse, state, amplitude) that of the amplitudes, `inner` (pulse,
     amplitude) how the errors follow the amplitudes, `schur` the factor of what is left of these.
@@ -36,7 +36,7 @@ class Solved:
     scale: Array
     root: Array
     through: Array
-    factor: tuple[Array, bool]
+    errors: Tridiagonal
     border: Array
     inner: Array
     schur: tuple[Array, bool]
@@ -49,21 +49,18 @@ class Solved:
         root = np.linalg.inv(np.linalg.cholesky(own))
         coupling = root @ cells[:, 1:-1, [0, -1]]
         less = np.moveaxis(coupling, 1, 2) @ coupling
-        band = np.zeros((2, len(cells)))
-        band[0, 1:] = (cells[:, 0, -1] - less[:, 0, 1])[:-1]
-        band[1] = 1.0 - less[:, 0, 0]
-        band[1, 1:] -= less[:-1, 1, 1]
+        left = Tridiagonal(1.0 - less[:, 0, 0], (cells[:, 0, -1] - less[:, 0, 1])[:-1])
+        left.diagonal[1:] -= less[:-1, 1, 1]
         through = np.moveaxis(root, 1, 2) @ coupling
-        factor = (cholesky_banded(band), False)
         errors = _of_errors(through, border)
-        inner = cho_solve_banded(factor, errors)
+        inner = left.solve(errors)
         rest = (root @ border[:, 1:]).reshape(-1, border.shape[2])
         schur = cho_factor(corner - rest.T @ rest - errors.T @ inner)
-        return cls(scale, root, through, factor, border, inner, schur)
+        return cls(scale, root, through, left, border, inner, schur)
 
     def of_states(self, right: Array) -> Array:
         """Return the states (pulse, state) for a right-hand side with the amplitudes as 0."""
-        errors = cho_solve_banded(self.factor, _of_errors(self.through, right[..., None])[:, 0])
+        errors = self.errors.solve(_of_errors(self.through, right[..., None])[:, 0])
         after = np.append(errors[1:], 0.0)
         rest = np.einsum('kji,kjl,kl->ki', self.root, self.root, right[:, 1:])
         rest -= self.through[:, :, 0] * errors[:, None] + self.through[:, :, 1] * after[:, None]
@@ -71,12 +68,12 @@ class Solved:
 
     def of_errors(self, right: Array) -> Array:
         """Return the errors (pulse, ...) for a right-hand side of the errors, amplitudes free."""
-        return np.asarray(cho_solve_banded(self.factor, right)
+        return np.asarray(self.errors.solve(right)
                           + self.inner @ cho_solve(self.schur, self.inner.T @ right))
 
     def of_state(self, state: int) -> tuple[Array, Array]:
         """Return variances (pulse,) with the amplitudes as 0, and how it follows these."""
-        variance, beside = self._variances
+        variance, beside = self.errors.inverse()
         if not state:
             return variance, self.inner
         i = state - 1
@@ -84,22 +81,10 @@ class Solved:
         own = np.einsum('kj,kjl->kl', self.root[:, :, i], self.root)
         inner = np.einsum('kl,kla->ka', own, self.border[:, 1:])
         local = own[:, i] + one**2 * variance
-        local[:-1] += other[:-1] ** 2 * variance[1:] + 2.0 * (one * other)[:-1] * beside
+        local[:-1] += other[:-1] ** 2 * variance[1:] + 2.0 * (one * other * beside)[:-1]
         inner -= one[:, None] * self.inner
         inner[:-1] -= other[:-1, None] * self.inner[1:]
         return local, inner
-
-    @cached_property
-    def _variances(self) -> tuple[Array, Array]:
-        """Return diagonal and next diagonal of the inverse of the tridiagonal matrix."""
-        beside, diagonal = self.factor[0]
-        ratio = np.append(beside[1:] / diagonal[:-1], 0.0)
-        found, last = np.empty(diagonal.size), 0.0
-        for k, (own, step) in enumerate(zip((diagonal**-2.0)[::-1].tolist(),
-                                            (ratio**2)[::-1].tolist())):
-            found[k] = last = own + step * last
-        found = found[::-1]
-        return found, -ratio[:-1] * found[1:]
 
 
 def _of_errors(through: Array, right: Array) -> Array:

@@ -56,9 +56,9 @@ class RecordRecovery:
     `times` (n,) in s are the measured trigger pulses, `missing` (n - 1,) the number of missing
     ones in each interval. `errors` and `standard_errors` (n,) in s are measured minus true, with
     mean 0 in each stretch, NaN outside of them; `bridged_errors` and `bridged_standard_errors`
-    (m,) have those of the interpolated pulses, too. `ripple` and `bend` (m - 1,) are the factors
-    of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s), NaN beside a missing
-    pulse, with their standard errors. `roughness` (s) is the RMS of what second differences of
+    (m,) have those of the interpolated pulses, too. `ripple` (m - 1,) is the factor of u (1 - u)
+    in the error inside a cycle (s), NaN beside a missing pulse, with its standard error.
+    `roughness` (s) is the RMS of what second differences of
     `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
     tones (Hz) that were fitted beside the declared ones. `fits` are those of the `stretches` of
     the `bridged` pulses. `expected_std` (3,) in s is what the fits expected of errors and bends.
@@ -72,8 +72,6 @@ class RecordRecovery:
     bridged_standard_errors: FloatArray
     ripple: FloatArray
     ripple_standard_error: float
-    bend: FloatArray
-    bend_standard_error: float
     roughness: float
     jitter_std: float
     undeclared: tuple[FloatArray, FloatArray]
@@ -233,18 +231,19 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
     """Return the recovery that the fits of some stretches make."""
     count = pulses.bridged.size
     errors, standard_errors = np.full(count, np.nan), np.full(count, np.nan)
-    bends = np.full((max(count - 1, 0), 2), np.nan)
+    ripple = np.full(max(count - 1, 0), np.nan)
     good = [fit for fit in fits if fit is not None]
     for stretch, fit in zip(stretches, fits):
         if fit is not None:
             errors[stretch], standard_errors[stretch] = fit.errors, fit.standard_errors
-            bends[stretch.start:stretch.stop - 1] = fit.bends
+            ripple[stretch.start:stretch.stop - 1] = fit.bends[:, 0]
     measured = np.zeros(count, np.bool_)
     measured[pulses.number] = True
-    bends[~(measured[:-1] & measured[1:])] = np.nan
-    bend_errors = np.sqrt(np.mean([fit.bend_standard_errors**2 for fit in good], axis=0)
-                          ) if good else np.full(2, np.inf)
-    bends[:, ~np.isfinite(bend_errors)] = np.nan
+    ripple[~(measured[:-1] & measured[1:])] = np.nan
+    ripple_error = float(np.sqrt(np.mean([fit.bend_standard_errors[0] ** 2 for fit in good]))
+                         ) if good else np.inf
+    if not np.isfinite(ripple_error):
+        ripple[:] = np.nan
     weights = [fit.errors.size for fit in good]
 
     def mean(values: Sequence[FloatArray]) -> FloatArray:
@@ -253,8 +252,7 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
     empty = np.zeros(0)
     longest = max(good, key=lambda fit: fit.errors.size, default=None)
     return RecordRecovery(
-        pulses.times, pulses.missing, pulses.number, errors, standard_errors, bends[:, 0],
-        float(bend_errors[0]), bends[:, 1], float(bend_errors[1]),
+        pulses.times, pulses.missing, pulses.number, errors, standard_errors, ripple, ripple_error,
         float(np.sqrt(mean([np.square(fit.roughness) for fit in good]))) if good else 0.0,
         float(np.sqrt(mean([np.square(fit.jitter_std) for fit in good]))) if good else 0.0,
         (empty, empty) if longest is None else (

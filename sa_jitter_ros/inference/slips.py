@@ -16,10 +16,9 @@ half a turn of the highest order or more may miss the right one, as a phase that
 the wrong turn. Around cycles that the lines do not fit, errors are chosen anew, all together.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.pulse_chain import shortest_path
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import fit_lines
 from scipy.special import gammainccinv
@@ -99,21 +98,3 @@ def _misfits(states: States, cycle: int, one: Array, other: Array, signals: Arra
     along = left @ columns.T
     return np.asarray(0.5 * (np.sum(left**2, axis=2)
                              - np.einsum('ijk,kl,ijl->ij', along, known, along)))
-
-
-def shortest_path(costs: Sequence[Array], steps: Sequence[Array]) -> tuple[list[int], float]:
-    """
-    Return the places that cost least together, one of each row, and what they cost.
-
-    `costs` are those of the places of each row, `steps` (row - 1 of (place, place)) those from
-    one row to the next (Viterbi 1967).
-    """
-    total, came = costs[0], []
-    for cost, step in zip(costs[1:], steps):
-        whole = total[:, None] + step
-        came.append(np.argmin(whole, axis=0))
-        total = whole.min(axis=0) + cost
-    path = [int(np.argmin(total))]
-    for row in reversed(came):
-        path.append(int(row[path[-1]]))
-    return path[::-1], float(total.min())
