@@ -105,13 +105,11 @@ def sections(found: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _machine(core: Mapping[str, Any], loop: Mapping[str, Any], graph: Mapping[str, Any]) -> str:
-    rows = [(name, value) for name, value in core['machine'].items() if name != 'load']
-    rows += [('loop and graph', ', '.join(
-        f'{name} {loop["machine"][name]}' for name in ('python', 'numpy', 'scipy')))]
-    rows += [('load average when the parts began',
-              ', '.join(str(part) for part in (core['machine']['load'], loop['machine']['load'],
-                                               graph['load'])))]
-    return table(('', ''), rows)
+    parts = [f'{name} {value}' for name, value in core['machine'].items() if name != 'load']
+    parts.append('loop and graph ' + ', '.join(
+        f'{name} {loop["machine"][name]}' for name in ('python', 'numpy', 'scipy')))
+    loads = core['machine']['load'], loop['machine']['load'], graph['load']
+    return f'{"; ".join(parts)}; load averages {", ".join(map(str, loads))}.'
 
 
 def _comparisons(comparisons: Sequence[Mapping[str, Any]]) -> str:
@@ -127,7 +125,7 @@ def _comparisons(comparisons: Sequence[Mapping[str, Any]]) -> str:
                   f'gain error in dB at f/fs = {" / ".join(f"{f:.2f}" for f in first["bands"])}'),
                  lines)
     notes = [f'\\* {name}: {row["note"]}.' for name, row in first['rows'].items() if row['note']]
-    notes += [f'{name} was skipped: {why}.' for name, why in first['skipped'].items()]
+    notes += [f'Not measured: {", ".join(first["skipped"])}.'] if first['skipped'] else []
     return '\n\n'.join((text, *notes))
 
 
@@ -140,26 +138,26 @@ def _limits(core: Mapping[str, Any]) -> str:
                      'times the latter')
     return (f'One core reads {limits["bandwidth"] / 1e9:.1f} GB/s from memory and does '
             f'{limits["multiply_adds"] / 1e9:.1f} 10^9 multiply-adds a second in a product of '
-            f'matrices: {limits["memory"]:.2f} ns to read a sample of 8 bytes once, '
+            f'matrices: {limits["memory"]:.2f} ns to read a sample of 8 bytes, '
             f'{limits["arithmetic"]:.2f} ns for the 16 multiply-adds of a resampled value. '
             f'{", ".join(texts)}.')
 
 
 def _loop(loop: Mapping[str, Any]) -> str:
-    rows = [(f'prediction of 64 orders: {name}', f'{value:.1f} ms', 'below 50 ms')
+    rows = [(f'prediction: {name}', f'{value:.1f} ms', '50 ms')
             for name, value in loop['prediction'].items()]
-    rows += [(f'recovery: {name}', f'{value:.0f} ms', 'below 250 ms' if ' 8 ' in name else '')
+    rows += [(f'recovery: {name}', f'{value:.0f} ms', '250 ms' if ' 8 ' in name else '')
              for name, value in loop['recovery'].items()]
     rows += [_closed(item) for item in loop['close_loop']]
-    return table(('', 'median', 'goal'), rows)
+    return table(('', 'time', 'limit'), rows)
 
 
 def _closed(item: Mapping[str, Any]) -> tuple[str, str, str]:
     found = ', '.join(item['missing']) or 'nothing'
     return (f'`close_loop`, recording of {item["megabytes"]:.1f} MB ({item["channels"]} channels, '
-            f'{item["seconds"]:.0f} s, gears: {item["gears"]}), found {found}; least of 5',
+            f'{item["seconds"]:.0f} s, gears: {item["gears"]}), found {found}',
             f'{item["wall"]:.1f} s ({item["cpu"]:.1f} s of CPU)',
-            'below 4 s' if item['megabytes'] < 20.0 else 'below 8 s')
+            '4 s' if item['megabytes'] < 20.0 else '8 s')
 
 
 def _graph(runs: Iterable[Mapping[str, Any]]) -> str:
