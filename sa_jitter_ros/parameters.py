@@ -184,8 +184,8 @@ PULSES_PER_TRIGGER = Parameter(
 TRIGGER_CYCLES = Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
                            maximum=1000000)
 #: Of every node, and of every node that takes data.
-HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in the diagnostics; empty: name '
-                        'of this computer')
+HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in diagnostics; empty: that of '
+                        'this computer')
 STALE_AFTER = Parameter('stale_after', 5.0, 'silence of an input that is a warning, three times '
                         'as long an error; 0: never', unit='s', minimum=0.0, maximum=1e6)
 

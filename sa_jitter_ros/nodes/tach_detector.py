@@ -43,14 +43,14 @@ JOINT_TYPE = 'sensor_msgs/JointState'
 PARAMETERS = (
     *sample_parameters('tach_waveform'),
     TACH_TYPE,
-    Parameter('tach_waveform_type', '', 'message type of tach_waveform: empty for that of '
-              f'vibration_type, or {JOINT_TYPE}, whose positions (rad) give the pulses',
+    Parameter('tach_waveform_type', '', 'message type of tach_waveform; empty: that of '
+              f'vibration_type; {JOINT_TYPE}: its positions (rad) give the pulses',
               read_only=True),
-    Parameter('joint', '', f'joint of {JOINT_TYPE} whose position is the angle; '
+    Parameter('joint', '', f'joint of {JOINT_TYPE} to follow; '
               'empty: the only one', read_only=True),
     replace(PULSES_PER_REVOLUTION, read_only=True, description='marks on a revolution of the '
             'joint, one at angle 0'),
-    Parameter('imu_axis', 'z', 'axis of linear acceleration that is the waveform',
+    Parameter('imu_axis', 'z', 'axis of linear acceleration',
               choices=('x', 'y', 'z'), read_only=True),
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the pulses'),
     *DETECTOR_PARAMETERS,
