@@ -20,16 +20,15 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, sample_parameters, TRIGGER_CYCLES,
-    Values)
+    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, sample_parameters, TACH_TYPE,
+    TRIGGER_CYCLES, Values)
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 from sa_jitter_ros.pulses.validation import GEOMETRY_MODES
 
 PARAMETERS = (
     *sample_parameters('vibration'),
-    Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse',
-              read_only=True),
+    TACH_TYPE,
     Parameter('imu_axis', 'z', 'axes of linear acceleration: one or more of x, y, z',
               read_only=True),
     Parameter('keyphasor', '', 'source of the pulses to use; empty: that of the first pulse',
@@ -49,11 +48,11 @@ PARAMETERS = (
               'next, below 0.5; 0: learnt; 1: accept every pulse', minimum=0.0, maximum=1.0),
     Parameter('minimum_interval', 0.0, 'a pulse this soon after another is dropped',
               unit='s', minimum=0.0),
-    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, subtracted from their '
-              'times', unit='s'),
+    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, which is '
+              'subtracted', unit='s'),
     Parameter('target_geometry', 'none', 'correction of uneven marks: learn (measured), given '
               '(target_angles)', choices=GEOMETRY_MODES),
-    Parameter('target_angles', [], 'how late each mark is, missing teeth left out; with '
+    Parameter('target_angles', [], 'how late each mark is, without missing teeth, for '
               'target_geometry given', unit='rad'),
     TRIGGER_CYCLES,
     Parameter('maximum_discarded', 0.0, 'most discarded cycles in an average, as a share of '

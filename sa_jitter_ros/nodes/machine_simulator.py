@@ -90,7 +90,7 @@ EFFECT_DEFAULTS = {
 def simulated_shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     """Return the parameters of one shaft."""
     return (
-        Parameter(f'{shaft}.ratio', 1.0, 'speed of this shaft / speed of the tach shaft',
+        Parameter(f'{shaft}.ratio', 1.0, 'speed over that of the tach shaft',
                   above=0.0, **FIXED),
         Parameter(f'{shaft}.teeth', 23, 'teeth of its gear: the mesh order', minimum=1, **FIXED),
         Parameter(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and '

@@ -23,8 +23,8 @@ from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     encode_samples, encode_samples_float32, known_type, SAMPLE_TYPES)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter
-from sa_jitter_ros.nodes.signals import PulseOutput, TACH_TYPE
-from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.nodes.signals import PulseOutput
+from sa_jitter_ros.parameters import Parameter, TACH_TYPE, Values
 from sa_jitter_ros.samples import SampleBlock
 from std_msgs.msg import Float64MultiArray
 

@@ -43,7 +43,7 @@ PARAMETERS = (
               read_only=True),
     Parameter('acquisition', 0, 'acquisition to play, of several in a file', minimum=0,
               read_only=True),
-    Parameter('sample_rate', 0.0, 'sampling rate of the vibration if the file does not contain it',
+    Parameter('sample_rate', 0.0, 'sampling rate of the vibration, if not in the file',
               unit='Hz', minimum=0.0, read_only=True),
     Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of '
               'a bag; empty: all but the tach', element=str, read_only=True),
