@@ -100,14 +100,11 @@ def sections(found: Mapping[str, Any]) -> dict[str, str]:
         'threads': table(('threads of linear algebra', 'recovery of 100 trigger cycles x 8 '
                           'channels, on the clock'),
                          [(name, f'{value:.0f} ms') for name, value in loop['threads'].items()]),
-        'graph': _graph(graph['runs']), 'latency': _latency(graph['latency']),
-        'saturation': _saturation(graph['runs'])}
+        'graph': _graph(graph['runs']), 'latency': _latency(graph['latency'])}
 
 
 def _machine(core: Mapping[str, Any], loop: Mapping[str, Any], graph: Mapping[str, Any]) -> str:
     parts = [f'{name} {value}' for name, value in core['machine'].items() if name != 'load']
-    parts.append('loop and graph ' + ', '.join(
-        f'{name} {loop["machine"][name]}' for name in ('python', 'numpy', 'scipy')))
     loads = core['machine']['load'], loop['machine']['load'], graph['load']
     return f'{"; ".join(parts)}; load averages {", ".join(map(str, loads))}.'
 
@@ -182,16 +179,6 @@ def _latency(runs: Iterable[Mapping[str, Any]]) -> str:
           *(f'{run[key]:.1f} ms' for key in ('pulse_median', 'pulse_99', 'data_median',
                                              'data_99')),
           f'{run["cpu_share"]:.1%}') for run in runs])
-
-
-def _saturation(runs: Iterable[Mapping[str, Any]]) -> str:
-    failed = [run for run in runs if not run['sustained']]
-    if not failed:
-        return 'Nothing saturated at these numbers of channels.'
-    names = list(failed[0]['diagnostics']['counts'])
-    return table(('channels', 'shared memory', *(f'`{name}`' for name in names)), [
-        (str(run['channels']), _memory(run),
-         *(str(run['diagnostics']['counts'][name]) for name in names)) for run in failed])
 
 
 def draw(found: Mapping[str, Any], folder: Path) -> None:

@@ -197,7 +197,7 @@ def test_what_does_not_hang_on_chance_agrees_in_a_quick_run(quick):
     found = {(item['item'], item['paper'].split(':')[0]): item['agreement']
              for item in numbers['findings']}
     for item, paper in (
-            ('Figs. 4-6', 'order tracking simulations and the exact model agree very well'),
+            ('Figs. 4-6', 'simulations and the exact model agree very well'),
             ('Fig. 4a', 'for integer r the approximate model coincides with the exact one'),
             ('Fig. 7', 'simulations and the exact model agree'),
             ('Fig. 7b', 'r = 1'), ('Fig. 3a', 'the mean of g1'),
