@@ -132,12 +132,11 @@ def _limits(core: Mapping[str, Any]) -> str:
         times = [item['rows'][name]['nanoseconds'] / limits['arithmetic']
                  for item in core['comparisons']]
         texts.append(f'*{name.partition(", ")[2]}* takes {min(times):.0f} to {max(times):.0f} '
-                     'times the latter')
-    return (f'One core reads {limits["bandwidth"] / 1e9:.1f} GB/s from memory and does '
-            f'{limits["multiply_adds"] / 1e9:.1f} 10^9 multiply-adds a second in a product of '
-            f'matrices: {limits["memory"]:.2f} ns to read a sample of 8 bytes, '
-            f'{limits["arithmetic"]:.2f} ns for the 16 multiply-adds of a resampled value. '
-            f'{", ".join(texts)}.')
+                     'times that')
+    return (f'One core reads a sample of 8 bytes in {limits["memory"]:.2f} ns '
+            f'({limits["bandwidth"] / 1e9:.1f} GB/s) and does the 16 multiply-adds of a resampled '
+            f'value in {limits["arithmetic"]:.2f} ns ({limits["multiply_adds"] / 1e9:.1f} 10^9 a '
+            f'second). {", ".join(texts)}.')
 
 
 def _loop(loop: Mapping[str, Any]) -> str:
