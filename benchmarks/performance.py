@@ -172,9 +172,9 @@ def _memory(run: Mapping[str, Any]) -> str:
 
 def _latency(runs: Iterable[Mapping[str, Any]]) -> str:
     return table(
-        ('messages of', 'averages', 'from the last pulse, median', '99 %',
+        ('messages of', 'from the last pulse, median', '99 %',
          'from when the last sample was sent, median', '99 %', 'CPU share'),
-        [(f'{run["block_milliseconds"]:.3g} ms', str(run['averages']),
+        [(f'{run["block_milliseconds"]:.3g} ms',
           *(f'{run[key]:.1f} ms' for key in ('pulse_median', 'pulse_99', 'data_median',
                                              'data_99')),
           f'{run["cpu_share"]:.1%}') for run in runs])
