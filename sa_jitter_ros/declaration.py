@@ -53,8 +53,8 @@ MODEL_PARAMETERS = (
               '1/(sqrt(12) keyphasor_rate)', unit='s', minimum=0.0),
     Parameter('jitter_table', [], 'equally likely pulse errors, for jitter_distribution table',
               unit='s'),
-    Parameter('noise_std', math.nan, 'standard deviation of white noise per sample, where '
-              'components have the amplitude 1; NaN: not declared (close_loop estimates it)',
+    Parameter('noise_std', math.nan, 'standard deviation of white noise per sample, of '
+              'components of amplitude 1; NaN: not declared (close_loop estimates it)',
               minimum=0.0),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration, needed with noise_std',
               unit='Hz', minimum=0.0),

@@ -173,7 +173,7 @@ def listed(values: Iterable[float], digits: int = 4) -> str:
 
 
 #: Beyond this range one shaft hardly turns during an average of the other.
-RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest / speed of the tach shaft',
+RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest over that of the tach shaft',
                   minimum=1e-3, maximum=1e3)
 PULSES_PER_REVOLUTION = Parameter(
     'pulses_per_revolution', 1, 'pulses per revolution of the tach shaft, with those of missing '
@@ -183,9 +183,12 @@ PULSES_PER_TRIGGER = Parameter(
     maximum=100000)
 TRIGGER_CYCLES = Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
                            maximum=1000000)
+TACH_TYPE = Parameter(
+    'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; '
+    'std_msgs/Float64MultiArray for more than some hundred pulses a second', read_only=True)
 #: Of every node, and of every node that takes data.
-HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in the diagnostics; empty: name '
-                        'of this computer')
+HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in diagnostics; empty: that of '
+                        'this computer')
 STALE_AFTER = Parameter('stale_after', 5.0, 'silence of an input that is a warning, three times '
                         'as long an error; 0: never', unit='s', minimum=0.0, maximum=1e6)
 
@@ -210,9 +213,9 @@ def sample_parameters(topic: str) -> tuple[Parameter, ...]:
     return (
         Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
                   read_only=True),
-        Parameter('sample_rate', 0.0, 'sampling rate of the input; 0 if the messages contain it',
+        Parameter('sample_rate', 0.0, 'sampling rate, if not in the messages',
                   unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
-        Parameter('start_time', 0.0, 'time of the first sample if the messages do not contain it',
+        Parameter('start_time', 0.0, 'time of the first sample, if not in the messages',
                   unit='s', read_only=True),
         Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
                   unit='s', above=0.0, read_only=True),

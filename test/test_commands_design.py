@@ -113,7 +113,7 @@ def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, 
 def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
     examples = re.findall(r'^    \$ ros2 run sa_jitter_ros design (.*)\n((?:    .*\n|\n)+)',
                           PAGE.read_text(encoding='utf-8'), re.MULTILINE)
-    assert len(examples) == 3
+    assert len(examples) == 2
     for arguments, printed in examples:
         assert design.main([*shlex.split(arguments), '--output', str(tmp_path / 'a.png')]) == 0
         lines = capsys.readouterr().out.splitlines()[:-2]  # without the name of the figure

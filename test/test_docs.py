@@ -461,12 +461,11 @@ def table_of_parameters():
         for key, *rest in rows:
             nodes_of.setdefault((key.removesuffix(STAR), *rest), {})[name] = key.endswith(STAR)
     lines = ['# Parameters', '',
-             'Every parameter of every node, for whoever writes a machine file or starts a node. '
-             'The first table has those that are the same in several nodes.', '',
-             '`<shaft>` stands for each name in `shafts`. A parameter with a star, or in a node '
-             'with a star, is read only when the node starts. `ros2 param describe` prints the '
-             'same. Units of channels: '
-             '[interfaces.md](interfaces.md#units-of-the-channels).',
+             'Every parameter of every node, for whoever writes a machine file or starts a node.',
+             '',
+             '`<shaft>` is each name in `shafts`. A parameter with a star, or in a node with a '
+             'star, is read only when the node starts. `ros2 param describe` prints the same. '
+             'Units of channels: [interfaces.md](interfaces.md#units-of-the-channels).',
              '', '## Several nodes', *table('parameter', 'nodes', 'default (allowed)', 'meaning')]
     lines += [f'| {key}{STAR * all(nodes.values())} | {those(nodes)} | {with_default(*values)} | '
               f'{meaning} |' for (key, *values, meaning), nodes in nodes_of.items()

@@ -197,7 +197,7 @@ def test_what_does_not_hang_on_chance_agrees_in_a_quick_run(quick):
     found = {(item['item'], item['paper'].split(':')[0]): item['agreement']
              for item in numbers['findings']}
     for item, paper in (
-            ('Figs. 4-6', 'order tracking simulations and the exact model agree very well'),
+            ('Figs. 4-6', 'simulations and the exact model agree very well'),
             ('Fig. 4a', 'for integer r the approximate model coincides with the exact one'),
             ('Fig. 7', 'simulations and the exact model agree'),
             ('Fig. 7b', 'r = 1'), ('Fig. 3a', 'the mean of g1'),
@@ -217,7 +217,8 @@ def test_the_published_page_is_one_run_of_the_full_command():
     assert '--quick' not in numbers['command']
     for finding in numbers['findings']:
         ours = finding['ours'].replace('|', '\\|')
-        assert f'| {ours} | {finding["agreement"]} |' in text
+        agrees = ': '.join(filter(None, (finding['agreement'], finding['why'])))
+        assert f'| {ours} | {agrees} |' in text
 
 
 def test_every_table_and_figure_of_the_paper_is_on_the_page():
@@ -236,7 +237,7 @@ def test_a_page_tells_what_disagrees():
     text = page({'single_harmonic': group}, 'reproduce --output docs')
     assert '| Fig. 1, Fig. 2, Figs. 12-14, Fig. 20 | nothing: ' in text
     assert '0 are reproduced, 0 partly, 1 not' in text
-    assert '| Fig. 0 | a\\|b | c | no | d |' in text
+    assert '| Fig. 0 | a\\|b | c | no: d |' in text
 
 
 @pytest.mark.parametrize(('arguments', 'message'), [

@@ -166,18 +166,17 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
         return ' and '.join(f'{value:.4f}' for value in values)
 
     return (
-        Finding('Fig. 16a,b', 'the average attenuation is predicted very well',
+        Finding('Fig. 16a,b', 'the mean attenuation is predicted very well',
                 f'mean ratio of the near sensors {means}; KS: smallest p '
                 f'{min(item.p_value for item in near):.3f}',
                 agreement(gap < 0.005, one_distribution(near))),
-        Finding('Fig. 16a,b', 'more dispersion than predicted, from noise, least close to the '
-                'mesh',
+        Finding('Fig. 16a,b', 'more dispersion than predicted, by noise, least close to the mesh',
                 'orders 19 and 38: predicted ' + listed(stds)
                 + f'; near 1 {listed(spread["near 1"])}; far 2 {listed(spread["far 2"])}',
                 agreement(*(spread['far 2'][h] > max(spread['near 1'][h], stds[h])
                             for h in range(len(HARMONICS))))),
-        Finding('Fig. 16a,b', 'the dispersion of the second harmonic is nearer to the predicted '
-                'one, close to the mesh',
+        Finding('Fig. 16a,b', 'close to the mesh, the dispersion of the second harmonic '
+                'is nearer to the prediction',
                 'over predicted, orders 19 and 38: '
                 + '; '.join(f'{sensor} {first:.2f} and {second:.2f}'
                             for sensor, (first, second) in zip(SENSORS[:_NEAR], excess))
@@ -185,15 +184,14 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
                 agreement(*(second < first for first, second in excess[:_NEAR]),
                           nearer > _ORDINARY * error_of_nearer),
                 f'Not significant with {len(linear)} acquisitions.'),
-        Finding('Fig. 16c-f', 'the linear law attenuates less than the quadratic law and the '
-                'spline',
+        Finding('Fig. 16c-f', 'the linear law loses less than quadratic law and spline',
                 'loss of orders 19 and 38 (near sensors): '
                 + '; '.join(f'{law} {listed(values)}' for law, values in losses.items())
                 + '; sign tests '
                 f'{chance(tests["quadratic"])} and {chance(tests["spline"])}',
                 agreement(*(value < SIGNIFICANCE for value in tests.values()),
                           min(advantage.values()) > 0.0),
-                'As the mean square [angle errors](theory.md#angle-laws).'),
+                'As the [angle errors](theory.md#angle-laws).'),
     )
 
 

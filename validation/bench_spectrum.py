@@ -60,14 +60,13 @@ def run(effort: Effort, progress: Progress) -> Results:
     centres, heights, widths = zip(*found.values())
     return Results(
         'Spectrum of the bench: Fig. 15', numbers,
-        (Finding('Fig. 15', 'the first mesh harmonic, near 1900 Hz, and the second are high '
-                 'above the noise',
+        (Finding('Fig. 15', 'two mesh harmonics, from 1900 Hz, are high above the noise',
                  'at ' + ' and '.join(f'{centre:.0f} Hz' for centre in centres[:2]) + ', '
                  + ' and '.join(f'{height:.0f}' for height in heights[:2])
                  + ' dB above the median', agreement(
                      abs(centres[0] - 1900.0) < 20.0, min(heights[:2]) > _HIGH),
                  'The noise is our choice.'),
-         Finding('Fig. 15', 'small speed fluctuations smear the lines, most at high frequencies',
+         Finding('Fig. 15', 'speed fluctuations smear the lines, most at high frequencies',
                  'RMS width of the first three mesh harmonics '
                  + ', '.join(f'{width:.1f}' for width in widths) + ' Hz',
                  agreement(list(widths) == sorted(widths), widths[2] > 2.0 * widths[0]))),

@@ -192,24 +192,24 @@ def _findings(fleet: list[Flights], predicted: Array, noisy: list[Array],
     z = same[0].mean() / (same[0].std() / math.sqrt(same[0].size))
     others = _other_cases(fleet, noisy)
     return (
-        Finding('Table 5, Fig. 21', 'the amplitude ratios of each helicopter are distributed as '
-                'predicted',
+        Finding('Table 5, Fig. 21',
+                'amplitude ratios of each helicopter are distributed as predicted',
                 f'mean ratio {pooled.mean():.4f} (predicted {plain.mean():.4f}); KS of '
                 f'{len(tests)} helicopters: smallest p '
                 f'{min(item.p_value for item in tests):.2g}',
                 agreement(abs(gap) < _CLOSE, one_distribution(tests))),
-        Finding('Fig. 21', 'more dispersion than predicted, which the noise explains',
+        Finding('Fig. 21', 'more dispersion than predicted, by noise',
                 f'standard deviation predicted {np.std(plain):.4f}; least to most noise '
                 f'{spread[0]:.4f} to {spread[-1]:.4f}, predicted with it {scatter[0]:.4f} to '
                 f'{scatter[-1]:.4f}; KS: smallest p '
                 f'{min(item.p_value for item in explained):.3f}',
                 agreement(spread[-1] > float(np.std(plain)), one_distribution(explained))),
-        Finding('Section 5.2.2', 'the added pulse errors are properly described by the model',
+        Finding('Section 5.2.2', 'added pulse errors are properly described by the model',
                 'same errors: measured minus modelled ratio '
                 f'{same[0].mean():.5f} +- {same[0].std():.4f} with the least noise, '
                 f'{same[1].mean():.5f} +- {same[1].std():.4f} with the most',
                 agreement(abs(z) < _ORDINARY, float(same[0].std()) < 0.2 * spread[0]),
-                'With the least noise, speed changes within trigger cycles remain.'),
+                'Speed changes within trigger cycles remain.'),
         Finding('Section 5.2.2', 'consistent for other uncertainties and harmonics',
                 '; '.join(f'{name}: mean {mean:.4f} (predicted {expected:.4f})'
                           for name, (mean, expected, _) in others.items())

@@ -95,8 +95,8 @@ def _findings(
         Finding('Fig. 7a', 'r = 2.286: the approximate model is not suitable',
                 f'KS distance of the models for r_hf = 2, 3, 4: {listed(rough)}',
                 agreement(*(value > 0.1 for value in rough))),
-        Finding('Fig. 7a', 'r = 2.286: mean as for a single harmonic, more dispersion, most for '
-                'the closest order',
+        Finding('Fig. 7a', 'r = 2.286: mean as of a single harmonic, more dispersion, '
+                'most of the closest order',
                 f'mean {listed(means(split))} (single {alone["mean"]:.4f}); standard deviation '
                 f'{listed(spreads(split))} (single {alone["radial_std"]:.4f})',
                 agreement(max(abs(mean - alone['mean']) for mean in means(split)) < 0.01,

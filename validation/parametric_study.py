@@ -142,36 +142,35 @@ def _findings(numbers: dict[str, Any]) -> tuple[Finding, ...]:
     added = [item['exact_mean'] for item in checks]
     error = numbers['largest_relative_error_of_the_approximation']
     return (
-        Finding('Figs. 9-11', 'the first two cumulants of the squared amplitude (Eqs. 47 to 50)',
+        Finding('Figs. 9-11', 'cumulants of the squared amplitude (Eqs. 47 to 50)',
                 f'{len(checks)} points: exact mean within {max(abs(value) for value in z):.1f} '
                 f'standard errors, variance of a normal X off by {100.0 * min(off):.1f} to '
                 f'{100.0 * max(off):.1f} %; Eqs. 40-45 add up to {100.0 * error["mean"]:.2f} % '
                 f'(mean) and {100.0 * error["variance"]:.1f} % (variance)',
                 agreement(max(abs(value) for value in z) < 4.0,
                           max(abs(value) for value in off) < 0.1),
-                'With the errata. A normal X does not lie along an arc, which counts at few '
-                'averages without noise.'),
+                'With the errata. A normal X does not lie along an arc: at few averages without '
+                'noise.'),
         Finding('Eqs. 48, 50', 'the variance as printed',
                 'printed over simulated at these points: '
                 + ', '.join(f'{value:.2f}' for value in printed),
                 agreement(*(abs(value - 1.0) < 0.1 for value in printed)),
-                'Errata: noise over N^2 in place of N, power of the trace in place of the trace '
-                'of the power.'),
-        Finding('Fig. 9', 'N_t hardly changes the expected value but much reduces the variance',
+                'Errata: noise over N^2 for N, power of the trace for trace of the power.'),
+        Finding('Fig. 9', 'N_t hardly changes the expected value, but reduces the variance',
                 f'D = 0.2, N_t 20 to 200: {text("N_t 20 to 200")}',
                 agreement(abs(ratios('N_t 20 to 200')[0] - 1.0) < 0.01,
                           ratios('N_t 20 to 200')[1] < 0.2)),
-        Finding('Fig. 9', 'D attenuates the expected value and raises the variance',
+        Finding('Fig. 9', 'D lowers the expected value and raises the variance',
                 f'N_t = 100, D 0.1 to 0.4: {text("D 0.1 to 0.4")}',
                 agreement(ratios('D 0.1 to 0.4')[0] < 0.8, ratios('D 0.1 to 0.4')[1] > 2.0)),
-        Finding('Fig. 10', 'noise changes the variance more than the expected value, less with '
-                'more averages',
+        Finding('Fig. 10',
+                'noise changes the variance more than the mean, less with more averages',
                 f'D = 0.2, noise variance 0 to 0.5: {text(few)} at N_t = 20; {text(many)} at '
                 'N_t = 100',
                 agreement(ratios(few)[1] > ratios(few)[0], ratios(many)[1] > ratios(many)[0],
                           _added(numbers, MANY) < _added(numbers, FEW))),
-        Finding('Fig. 11', 'noise leaves the expected value almost alone; its effect on the '
-                'variance matters most for few averages',
+        Finding('Fig. 11', 'noise hardly changes the expected value, and the variance '
+                'most with few averages',
                 f'D = 0.2: adds {added[3] - added[0]:.4f} to the expected value at N_t = 20, '
                 f'{_added(numbers, FEW):.2e} to the variance, {_added(numbers, MANY):.2e} at '
                 'N_t = 100',

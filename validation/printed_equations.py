@@ -161,14 +161,14 @@ def run(effort: Effort, progress: Progress) -> Results:
         'noise_times_root_of_n': {'value': noise, 'standard_error': standard_error}}
     return Results(
         'Angle law, comb filter, jittered cycles: Eqs. 5 to 18', numbers,
-        (Finding('Eq. 8', 'the average is a comb filter of unit gain at whole orders',
-                 f'{_CYCLES} cycles of six tones: largest difference {comb:.1e}',
+        (Finding('Eq. 8', 'a comb filter of unit gain at whole orders',
+                 f'{_CYCLES} cycles, six tones: largest difference {comb:.1e}',
                  agreement(comb < 1e-6)),
          Finding('Section 2.2', 'stationary noise is attenuated by 1/sqrt(N)',
                  f'after {_CYCLES} cycles, times sqrt(N): {noise:.4f} +- '
                  f'{standard_error:.4f}',
                  agreement(abs(noise - 1.0) < _ORDINARY * standard_error)),
-         Finding('Eqs. 9-12', 'a random shift of each cycle is no model of order tracking',
+         Finding('Eqs. 9-12', 'random shifts of cycles are no model of order tracking',
                  f'gain at D = {_WIDTH}: shifts {shifted:.4f} (Eq. 12), linear law '
                  f'{stretched:.4f} (Eq. 38)', agreement(stretched - shifted > 0.05)),
          Finding('Eqs. 16, 18', 'jitter stretches a cycle and moves it',

@@ -94,5 +94,5 @@ def _finding(found: dict[int, tuple[Losses, Losses]]) -> Finding:
         f'{default} of {total} are lost (simulation 1: {first.lost} of '
         f'{first.recordings * first.cycles}), with `interval_tolerance` {WIDE} {wide}',
         agreement(default == 0, wide <= _FEW * total),
-        'So large a jitter looks like stray or missing pulses. If it is known to be a tenth of an '
-        f'interval or more, set `interval_tolerance` to {WIDE}.')
+        'So large a jitter looks like stray or missing pulses: set `interval_tolerance` to '
+        f'{WIDE} if it is a tenth of an interval or more.')

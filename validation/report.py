@@ -30,15 +30,15 @@ paper with ours:
 
     {command}
 
-The numbers of each case, and the settings that differ from the paper, are in `validation.json`.
+The settings that differ from the paper, and the numbers of each case, are in `validation.json`.
 
 D is the width of the uniform pulse error in cycles of the analysed order, N_t the number of
 trigger cycles in an average, r that of fundamental cycles in a trigger cycle. The exact model
 splits fundamental cycles that straddle a pulse, the approximate one (Eq. 26) does not. *Same
-errors*: the pulse errors are the same. KS is a two-sample Kolmogorov-Smirnov test, at 1 % for each
-family (Bonferroni). Of the kurtosis, *separation* is the difference of the means over the standard
-deviation, *detection* that at 5 % false alarms, *area* that under the ROC curve. The agreement is
-*yes* if all conditions of the command hold, *partly* if some do.
+errors*: two models with the same pulse errors. KS: two-sample Kolmogorov-Smirnov test, at 1 % for
+each family of tests (Bonferroni). For the kurtosis, *separation* is the difference of the means
+over the standard deviation, *detection* the share of faults found at 5 % false alarms, *area* that
+under the ROC curve. A finding agrees (*yes*) if all its conditions hold, *partly* if some do.
 
 """
 
@@ -72,11 +72,11 @@ def page(results: Mapping[str, Results], command: str) -> str:
              f'{count["partly"]} partly, {count["no"]} not.\n', _items()]
     for group in groups:
         lines.append(f'\n## {group.title}\n')
-        rows = [('', 'the paper', 'here', 'agreement', 'why'),
-                *((item.item, item.paper, item.ours, item.agreement, item.why)
+        rows = [('', 'the paper', 'here', 'agrees'),
+                *((item.item, item.paper, item.ours,
+                   ': '.join(filter(None, (item.agreement, item.why))))
                   for item in group.findings)]
-        width = 5 if any(item.why for item in group.findings) else 4
-        lines.append(_table([row[:width] for row in rows]))
+        lines.append(_table(rows))
         lines += [f'![{stem}](figures/validation-{stem}.png)\n' for stem in group.figures]
     return '\n'.join(lines)
 

@@ -233,7 +233,7 @@ def _findings(
     areas = [detections[case.figure, 'jittered'].area for case in CASES]
     kept = [detections[case.figure, 'jittered'].separation for case in CASES]
     findings.append(Finding(
-        'Figs. 18, 19', 'detection is not impeded, least with two mesh harmonics in the band',
+        'Figs. 18, 19', 'detection is not impeded, least by two mesh harmonics in the band',
         f'area {areas[0]:.4f} and {areas[1]:.4f}, separation {kept[0]:.1f} and {kept[1]:.1f}',
         agreement(min(areas) > 0.9, areas[1] >= areas[0], kept[1] > kept[0])))
     return tuple(findings)

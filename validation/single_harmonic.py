@@ -174,7 +174,7 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
         return f'{values[0]:{form}} to {values[-1]:{form}}'
 
     return (
-        Finding('Figs. 4-6', 'order tracking simulations and the exact model agree very well',
+        Finding('Figs. 4-6', 'simulations and the exact model agree very well',
                 f'KS of {len(tests)} cases: smallest p {min(item.p_value for item in tests):.3f}, '
                 f'pooled {pooled["p_value"]:.3f}; same errors: within {max(gap, order_gap):.1e}',
                 agreement(one_distribution(tests), pooled['p_value'] > SIGNIFICANCE,
@@ -192,15 +192,15 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
                 + range_of([cases[k].approximation_test.distance for k in (5, 8)], '.3f'),
                 agreement(*(item.approximation_test.p_value < 0.01
                             for item in (cases[5], cases[8])))),
-        Finding('Fig. 5', 'larger D: more attenuation, more dispersion, a worse approximate model',
+        Finding('Fig. 5', 'larger D: more loss and dispersion, a worse approximate model',
                 f'D 0.1 to 0.4: loss {range_of(loss)}; standard deviation {range_of(scatter)}; '
                 f'means differ by {range_of(bias, ".5f")}',
                 agreement(loss == sorted(loss), scatter == sorted(scatter),
                           bias == sorted(bias))),
-        Finding('Fig. 6', 'r changes a single harmonic hardly at all',
+        Finding('Fig. 6', 'r hardly changes a single harmonic',
                 f'mean for r = 1, 2.286, 75.27: {listed(ratio_means, ".5f")}',
                 agreement(max(ratio_means) - min(ratio_means) < 0.1 * scatter[1])),
-        Finding('Fig. 6', 'at a high r the approximate model is better',
+        Finding('Fig. 6', 'the approximate model is better at a high r',
                 'bias of the mean for r = 2.286 and 75.27: ' + listed(errors[1:], '.1e'),
                 agreement(errors[2] < 0.2 * errors[1])),
     )

@@ -20,18 +20,17 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, sample_parameters, TRIGGER_CYCLES,
-    Values)
+    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, sample_parameters, TACH_TYPE,
+    TRIGGER_CYCLES, Values)
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 from sa_jitter_ros.pulses.validation import GEOMETRY_MODES
 
 PARAMETERS = (
     *sample_parameters('vibration'),
-    Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse',
+    TACH_TYPE,
+    Parameter('imu_axis', 'z', 'axes of linear acceleration: one or more of x, y, z',
               read_only=True),
-    Parameter('imu_axis', 'z', 'axes of linear acceleration that are the channels: one or more '
-              'of x, y, z', read_only=True),
     Parameter('keyphasor', '', 'source of the pulses to use; empty: that of the first pulse',
               read_only=True),
     Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
@@ -46,18 +45,18 @@ PARAMETERS = (
     Parameter('maximum_missing', 3, 'most consecutive missing pulses; more are a standstill',
               minimum=0, maximum=1000),
     Parameter('interval_tolerance', 0.0, 'largest relative change from one pulse interval to the '
-              'next; 0: learnt; below 0.5, or 1: accept every pulse', minimum=0.0, maximum=1.0),
-    Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
+              'next, below 0.5; 0: learnt; 1: accept every pulse', minimum=0.0, maximum=1.0),
+    Parameter('minimum_interval', 0.0, 'a pulse this soon after another is dropped',
               unit='s', minimum=0.0),
-    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, subtracted from their '
-              'times', unit='s'),
+    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, which is '
+              'subtracted', unit='s'),
     Parameter('target_geometry', 'none', 'correction of uneven marks: learn (measured), given '
               '(target_angles)', choices=GEOMETRY_MODES),
-    Parameter('target_angles', [], 'how late each mark is, missing teeth left out; with '
+    Parameter('target_angles', [], 'how late each mark is, without missing teeth, for '
               'target_geometry given', unit='rad'),
     TRIGGER_CYCLES,
-    Parameter('maximum_discarded', 0.0, 'most discarded cycles within an average, as a share of '
-              'trigger_cycles; 0: a discarded cycle ends the average', minimum=0.0, maximum=1.0),
+    Parameter('maximum_discarded', 0.0, 'most discarded cycles in an average, as a share of '
+              'trigger_cycles; 0: the first ends it', minimum=0.0, maximum=1.0),
     Parameter('averaging', 'block', 'block: an average of every trigger_cycles cycles; sliding, '
               'exponential: one after each cycle', choices=AVERAGING),
     Parameter('angle_law', 'linear', 'how the angle runs between pulses, the same in averager '
@@ -86,8 +85,8 @@ def shaft_parameters(name: str) -> tuple[Parameter, ...]:
                   maximum=100),
         Parameter(f'{name}.bearing_orders', [], 'bearing orders of this shaft (cage, balls, '
                   'rings), for the squared envelope', above=0.0),
-        Parameter(f'{name}.envelope_band', [], 'band of the residual signal whose envelope is '
-                  'taken; empty: all', unit='Hz', minimum=0.0),
+        Parameter(f'{name}.envelope_band', [], 'lowest and highest frequency of the envelope '
+                  'band; empty: all', unit='Hz', minimum=0.0),
     )
 
 

@@ -57,7 +57,7 @@ class PathDelay(Effect):
     remedy: ClassVar[str] = 'give the delay to the averager (path_delay)'
     timing: ClassVar[Pattern] = Pattern(
         _of_speed, show_in_times=False, usual=lambda setting: USUAL_DELAY / setting.unit)
-    delay: float = parameter(0.0, 'time by which the pulses come late, relative to the vibration',
+    delay: float = parameter(0.0, 'delay of the pulses behind the vibration',
                              's', minimum=-1.0, maximum=1.0)
 
     @classmethod

@@ -44,14 +44,14 @@ _SAME_RUN = 0.1
 _FARTHEST = 4.0
 
 PARAMETERS = (
-    Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of everything '
-              'together', above=0.0, maximum=1e4),
+    Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of all '
+              'tests together', above=0.0, maximum=1e4),
     Parameter('learning_averages', 200, 'averages that a bin learns before it tests, at least '
               f'{LEAST_LEARNED} groups', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
     Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
               maximum=10000, read_only=True),
-    Parameter('allow_uncorrected', False, 'take raw values where there is no correction; then '
-              'another keyphasor is a change, too'),
+    Parameter('allow_uncorrected', False, 'take raw values without a correction; another '
+              'keyphasor is then a change'),
     Parameter('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
               minimum=1e-4, maximum=1.0, read_only=True),
     Parameter('state_bin', 0.0, 'width of a bin of the operating state; 0: one for all',

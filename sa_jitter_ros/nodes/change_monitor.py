@@ -44,10 +44,10 @@ PARAMETERS = (
     *TEST_PARAMETERS,
     Parameter('severe_change', 0.25, 'relative change that is an error, if larger by two standard '
               'errors; others are warnings', above=0.0, maximum=1e6),
-    Parameter('baseline_file', '', 'file of the baseline (.npz); empty: '
+    Parameter('baseline_file', '', 'file of the baseline; empty: '
               'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: not '
               'kept', read_only=True),
-    Parameter('relearn', False, 'true: learn a new baseline; the old file is kept, with a number '
+    Parameter('relearn', False, 'learn a new baseline; the old file is kept, with a number '
               'in its name'),
     Parameter('operating_state_type', 'std_msgs/Float64', 'message type of operating_state; '
               'std_msgs/Float64MultiArray is [time on the clock of the averages, value]',

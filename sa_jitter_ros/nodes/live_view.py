@@ -41,7 +41,7 @@ PARAMETERS = (
     Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
     Parameter('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
               maximum=65535, read_only=True),
-    Parameter('open_to_network', False, 'allow a host that others can reach; everybody then sees '
+    Parameter('open_to_network', False, 'allow a host that others reach, who then see '
               'everything', read_only=True),
     Parameter('vibration_unit', '', 'unit of the vibration on labels; empty: that of '
               'machine.channels'),

@@ -62,8 +62,8 @@ PARAMETERS = (
     Parameter('jitter_distribution', 'uniform', 'distribution of the declared pulse error; '
               'sampled: times rounded up to ticks of keyphasor_rate',
               choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
-    Parameter('jitter_std', 0.0, 'standard deviation of the declared pulse error; 0: '
-              '1/(sqrt(12) keyphasor_rate)',
+    Parameter('jitter_std', 0.0, 'standard deviation of a normal or triangular pulse error; '
+              '0: 1/(sqrt(12) keyphasor_rate)',
               unit='s', minimum=0.0),
     Parameter('jitter_table', [], 'equally likely pulse errors, for jitter_distribution table',
               unit='s'),
@@ -90,13 +90,13 @@ EFFECT_DEFAULTS = {
 def simulated_shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     """Return the parameters of one shaft."""
     return (
-        Parameter(f'{shaft}.ratio', 1.0, 'speed of this shaft / speed of the tach shaft',
+        Parameter(f'{shaft}.ratio', 1.0, 'speed over that of the tach shaft',
                   above=0.0, **FIXED),
         Parameter(f'{shaft}.teeth', 23, 'teeth of its gear: the mesh order', minimum=1, **FIXED),
         Parameter(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and '
                   'its multiples', minimum=0.0, **FIXED),
-        Parameter(f'{shaft}.sidebands', 0.2, 'amplitude of the sidebands one order beside each '
-                  'multiple, relative', minimum=0.0, **FIXED),
+        Parameter(f'{shaft}.sidebands', 0.2, 'relative amplitude of sidebands one order beside '
+                  'each multiple', minimum=0.0, **FIXED),
         Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst of a chipped tooth, once '
                   'a revolution'),
     )

@@ -34,8 +34,8 @@ FloatArray = NDArray[np.float64]
 PARAMETERS = (
     Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
     Parameter('loop', False, 'start again at the end; times and indices continue'),
-    Parameter('tach', 'auto', 'keyphasor to play; reference: the reference keyphasor; both: '
-              'pulses and waveform; auto: the first of pulses, waveform, reference',
+    Parameter('tach', 'auto', 'keyphasor to play; both: pulses and waveform; auto: the first of '
+              'pulses, waveform, reference',
               choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'), read_only=True),
     Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: as '
               'recorded', unit='Hz', minimum=0.0, read_only=True),
@@ -43,7 +43,7 @@ PARAMETERS = (
               read_only=True),
     Parameter('acquisition', 0, 'acquisition to play, of several in a file', minimum=0,
               read_only=True),
-    Parameter('sample_rate', 0.0, 'sampling rate of the vibration if the file does not contain it',
+    Parameter('sample_rate', 0.0, 'sampling rate of the vibration, if not in the file',
               unit='Hz', minimum=0.0, read_only=True),
     Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of '
               'a bag; empty: all but the tach', element=str, read_only=True),

@@ -21,16 +21,13 @@ from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     encode_pulse_array, encode_pulse_reference, known_type, PULSE_TYPES, SAMPLE_TYPES,
     SampleDecoder)
-from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.parameters import Values
 from sa_jitter_ros.recordings.channel_units import Channels, scale_of
 from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import TimeReference
 
 NO_HEADER = ('messages have no header: sample times are counted from start_time, and lost samples '
              'are not detected; send time, sampling rate and index of the first sample')
-TACH_TYPE = Parameter(
-    'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; '
-    'std_msgs/Float64MultiArray for more than some hundred pulses a second', read_only=True)
 
 
 class SampleInput:

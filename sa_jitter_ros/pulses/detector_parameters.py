@@ -19,14 +19,14 @@ DETECTOR_PARAMETERS = (
     Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
     Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of high '
               'minus low level', minimum=0.0, maximum=0.99),
-    Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below; '
-              'auto: the rarer level of the start is the pulse',
+    Parameter('polarity', 'positive', 'positive: pulses are above the threshold; negative: below; '
+              'auto: pulses have the rarer level',
               choices=('positive', 'negative', 'auto')),
     Parameter('edge', 'rising', 'edge of the pulse that gives its time',
               choices=('rising', 'falling', 'centre')),
     Parameter('interpolate', True, 'interpolate the time between samples; false: first sample '
               'past the threshold'),
-    Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
+    Parameter('minimum_interval', 0.0, 'a pulse this soon after another is dropped',
               unit='s', minimum=0.0),
     Parameter('learning_time', 0.5, 'length of the windows from which the levels are learnt',
               unit='s', above=0.0, maximum=60.0),
