@@ -357,7 +357,7 @@ def _hidden_tone(observation: Observation, density: Array) -> tuple[float, float
     if not observation.recoveries or not density.size:
         return 0.0, math.inf
     samples = observation.sample_rate * max(
-        float(np.ptp(item.bridged[part])) for item in observation.recoveries
+        float(np.ptp(item.pulses.bridged[part])) for item in observation.recoveries
         for part in item.stretches)
     error = math.sqrt(2.0 / samples) * float(np.median(density))
     return least_seen(samples, len(observation.channel_names)) * error, error

@@ -142,7 +142,7 @@ def _runs(observation: Observation) -> tuple[Array, Array]:
     runs, numbers = [], []
     for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
         recovery = observation.recoveries[recording]
-        number = int(recovery.number[item.first])
+        number = int(recovery.pulses.number[item.first])
         runs.append((recording, next((part.start for part in recovery.stretches
                                       if part.start <= number < part.stop), -1)))
         numbers.append(number)
@@ -173,7 +173,7 @@ def _errors(observation: Observation) -> Iterator[Array]:
     """Yield the errors of the bridged pulses of each acquisition in s, their mean included."""
     for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
         recovery = observation.recoveries[recording]
-        start = int(recovery.number[item.first])
+        start = int(recovery.pulses.number[item.first])
         yield recovery.bridged_errors[start:start + item.bridged.size]
 
 

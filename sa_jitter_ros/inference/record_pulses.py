@@ -73,6 +73,13 @@ class RecordPulses:
         return numbered(self.missing)
 
     @property
+    def measured(self) -> BoolArray:
+        """Return which of the bridged pulses (m,) were measured."""
+        found = np.zeros(self.bridged.size, np.bool_)
+        found[self.number] = True
+        return found
+
+    @property
     def index(self) -> IntArray:
         """Return the number of trigger cycles from the first mark to each pulse (n,)."""
         return self.ahead + self.number

@@ -53,21 +53,17 @@ class RecordRecovery:
     """
     Pulse errors of a recording, recovered from its vibration.
 
-    `times` (n,) in s are the measured trigger pulses, `missing` (n - 1,) the number of missing
-    ones in each interval. `errors` and `standard_errors` (n,) in s are measured minus true, with
+    `errors` and `standard_errors` (n,) in s are measured minus true, with
     mean 0 in each stretch, NaN outside of them; `bridged_errors` and `bridged_standard_errors`
     (m,) have those of the interpolated pulses, too. `ripple` (m - 1,) is the factor of u (1 - u)
     in the error inside a cycle (s), NaN beside a missing pulse, with its standard error.
     `roughness` (s) is the RMS of what second differences of
     `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
     tones (Hz) that were fitted beside the declared ones. `fits` are those of the `stretches` of
-    the `bridged` pulses. `expected_std` (3,) in s is what the fits expected of errors and bends.
-    `ahead` trigger pulses before the first one the marks are counted from.
+    the bridged `pulses`. `expected_std` (3,) in s is what the fits expected of errors and bends.
     """
 
-    times: FloatArray
-    missing: NDArray[np.int64]
-    number: NDArray[np.int64]
+    pulses: RecordPulses
     bridged_errors: FloatArray
     bridged_standard_errors: FloatArray
     ripple: FloatArray
@@ -76,20 +72,18 @@ class RecordRecovery:
     jitter_std: float
     undeclared: tuple[FloatArray, FloatArray]
     fits: tuple[RecordFit, ...]
-    bridged: FloatArray
     stretches: tuple[slice, ...]
     expected_std: FloatArray
-    ahead: int = 0
 
     @property
     def errors(self) -> FloatArray:
         """Return the errors of the measured pulses (n,)."""
-        return self.bridged_errors[self.number]
+        return self.bridged_errors[self.pulses.number]
 
     @property
     def standard_errors(self) -> FloatArray:
         """Return the standard errors of the errors of the measured pulses (n,)."""
-        return self.bridged_standard_errors[self.number]
+        return self.bridged_standard_errors[self.pulses.number]
 
     @property
     def size(self) -> float:
@@ -237,9 +231,7 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
         if fit is not None:
             errors[stretch], standard_errors[stretch] = fit.errors, fit.standard_errors
             ripple[stretch.start:stretch.stop - 1] = fit.bends[:, 0]
-    measured = np.zeros(count, np.bool_)
-    measured[pulses.number] = True
-    ripple[~(measured[:-1] & measured[1:])] = np.nan
+    ripple[~(pulses.measured[:-1] & pulses.measured[1:])] = np.nan
     ripple_error = float(np.sqrt(np.mean([fit.bend_standard_errors[0] ** 2 for fit in good]))
                          ) if good else np.inf
     if not np.isfinite(ripple_error):
@@ -252,19 +244,19 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
     empty = np.zeros(0)
     longest = max(good, key=lambda fit: fit.errors.size, default=None)
     return RecordRecovery(
-        pulses.times, pulses.missing, pulses.number, errors, standard_errors, ripple, ripple_error,
+        pulses, errors, standard_errors, ripple, ripple_error,
         float(np.sqrt(mean([np.square(fit.roughness) for fit in good]))) if good else 0.0,
         float(np.sqrt(mean([np.square(fit.jitter_std) for fit in good]))) if good else 0.0,
         (empty, empty) if longest is None else (
-            longest.orders[longest.declared:], longest.tones), tuple(good), pulses.bridged,
+            longest.orders[longest.declared:], longest.tones), tuple(good),
         tuple(part for part, fit in zip(stretches, fits) if fit is not None),
         np.sqrt(mean([fit.expected_std**2 for fit in good])) if good else np.zeros(3))
 
 
 def _roughness(recovery: RecordRecovery) -> float:
     """Return the RMS of second differences of corrected pulse times, by their median."""
-    corrected = recovery.times - recovery.errors
-    whole = (recovery.missing[1:] == 0) & (recovery.missing[:-1] == 0)
+    corrected, missing = recovery.pulses.times - recovery.errors, recovery.pulses.missing
+    whole = (missing[1:] == 0) & (missing[:-1] == 0)
     second = np.diff(corrected, 2)[whole]
     second = np.abs(second[np.isfinite(second)])
     if not second.size:
@@ -287,7 +279,7 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     level = np.abs(fit.amplitudes[:, :declared]).max(axis=1, keepdims=True)
     share = np.max(np.abs(fit.amplitudes) / level, axis=0)
     # a trigger cycle that missing pulses make longer reads these as the declared ones
-    longer = 1 + np.unique(recovery.missing[recovery.missing > 0])
+    longer = 1 + np.unique(recovery.pulses.missing[recovery.pulses.missing > 0])
     read = np.divide.outer(np.array(model.orders), longer)
     resolved = 1.0 / (model.trigger_cycles * model.cycle_length)
     near = np.abs(fit.orders[:, None] - read.ravel()).min(axis=1, initial=np.inf) < (

@@ -117,14 +117,15 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
         grid = _grid(observation.pulses.times, clock)
         return [_of_average(observation, observation.acquisitions[a], unit, grid, clock.rate)
                 for a in chosen]
-    grids = [_grid(recovery.times, clock) for recovery in observation.recoveries]
+    grids = [_grid(recovery.pulses.times, clock) for recovery in observation.recoveries]
     # where the vibration resolves the errors, it shows more than the reference keyphasor does
     resolved = np.median(np.concatenate([
-        item.bridged_standard_errors[item.number] for item in observation.recoveries]))
+        item.standard_errors for item in observation.recoveries]))
     reference = None if resolved < _RESOLVED * unit else observation.pulses.reference
     for number, first, last in _runs(observation, chosen):
         recovery = observation.recoveries[number]
-        start, stop = recovery.number[first], recovery.number[last] + 1
+        numbers = recovery.pulses.number
+        start, stop = numbers[first], numbers[last] + 1
         for part, fit in zip(recovery.stretches, recovery.fits):
             here = slice(max(part.start, start), min(part.stop, stop))
             if here.stop - here.start < 3:
@@ -248,10 +249,8 @@ def _stretch(model: DeclaredModel, recovery: RecordRecovery, part: slice, here: 
     `imposed` are the errors that a clock of some `rate` imposes on the measured pulses. With the
     times of a `reference` the errors are those against it.
     """
-    bridged, errors = recovery.bridged[here], recovery.bridged_errors[here]
-    measured = np.zeros(recovery.bridged.size, np.bool_)
-    measured[recovery.number] = True
-    measured = measured[here]
+    pulses, errors = recovery.pulses, recovery.bridged_errors[here]
+    bridged, measured = pulses.bridged[here], pulses.measured[here]
     expected = recovery.expected_std
     bends = np.nan_to_num(recovery.ripple[here.start:here.stop - 1])
     error_std = float(np.median(recovery.bridged_standard_errors[here][measured]))
@@ -267,12 +266,12 @@ def _stretch(model: DeclaredModel, recovery: RecordRecovery, part: slice, here: 
         bend_std = math.inf  # what shows no errors shows no bends
     grid = None
     if imposed is not None:
-        grid = np.zeros(recovery.bridged.size)
-        grid[recovery.number] = imposed
+        grid = np.zeros(pulses.bridged.size)
+        grid[pulses.number] = imposed
         grid = grid[here]
-    index = recovery.ahead + np.arange(here.start, here.stop)
+    index = pulses.ahead + np.arange(here.start, here.stop)
     setting = Setting(model, unit, index, bridged, bridged - errors,
-                      float(recovery.bridged[0]), recovery.bridged[part], grid, rate)
+                      float(pulses.bridged[0]), pulses.bridged[part], grid, rate)
     return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
                    bend_std, bend_prior, reference is not None)
 

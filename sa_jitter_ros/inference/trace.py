@@ -109,7 +109,8 @@ def _counted_alike(item: Observation, first: Observation) -> Observation:
         (_indices(one), one.stacked('errors')) for one in (first, item)))
     return replace(
         item, pulses=replace(item.pulses, ahead=ahead),
-        recoveries=tuple(replace(found, ahead=ahead) for found in item.recoveries))
+        recoveries=tuple(replace(found, pulses=replace(found.pulses, ahead=ahead))
+                         for found in item.recoveries))
 
 
 def _counted_anew(effect: Effect, observations: Sequence[Observation]) -> Effect:
