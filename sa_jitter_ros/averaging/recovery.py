@@ -290,8 +290,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
             candidates, clearest = search.strongest(errors, most, below=reach)
             clear = np.union1d(clear, clearest)
             if clearest.size:
-                candidates = candidates[search.plausible(errors, candidates,
-                                                          cycles=len(grid.cycles))]
+                candidates = candidates[search.plausible(
+                    errors, candidates, cycles=len(grid.cycles))]
         # at most half as many unknowns as a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])
