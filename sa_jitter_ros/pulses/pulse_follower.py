@@ -267,7 +267,8 @@ class PulseFollower:
         slots = (self.slot + np.arange(skipped)) % lock.steps.size
         gap = self._queue[0] - self.confirmed
         level = math.log(gap / float(lock.widths[slots].sum()))
-        self._irregular(skipped, level, 0.0, best.steps[-1].level)
+        off = math.expm1(level - self._model.expected)  # a path that jumps miscounts them
+        self._irregular(skipped, level, off, best.steps[-1].level)
         return True
 
     def _drop_stray(self) -> None:

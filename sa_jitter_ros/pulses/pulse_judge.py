@@ -136,7 +136,7 @@ class PulseJudge:
             if number and max(abs(item - number) for item in teeth) <= NEAR_WHOLE:
                 passed = number
             known_better = end.known >= max(_KNOWN_WELL, count)
-            if known_better or scatter < _SAME_SCATTER * end.scatter:
+            if known_better or 1.0 / _SAME_SCATTER < scatter / end.scatter < _SAME_SCATTER:
                 scatter, count = end.scatter, max(count, end.known)
         self._counter.begin(first, int(lock.teeth[lock.slot]), passed=passed)
         model.start(math.log(lock.interval), scatter=scatter, count=count,
