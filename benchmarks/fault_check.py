@@ -26,8 +26,8 @@ from itertools import combinations
 from typing import Any
 
 from fault_graph import Received
-from fault_machine import (AROUND, equal_weights, exponential_weights, FloatArray, Run, TEETH,
-                           RATE, Window)
+from fault_machine import (AROUND, equal_weights, exponential_weights, FloatArray, RATE, Run,
+                           TEETH, Window)
 import numpy as np
 from sa_jitter_ros.averaging.cycle import waveform_cutoff
 from sa_jitter_ros.nodes.messages import AverageMessage
