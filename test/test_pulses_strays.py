@@ -380,8 +380,8 @@ def test_large_errors_are_no_strays(shape, per_revolution):
         validator.flush()
         counts = validator.finish()
         assert counts.unlocked <= 4
-        # one of two places at random, a tenth of an interval apart: a loose mark, if many are seen
-        displaced = counts.displaced if shape == 'bimodal' and width == 0.1 else 0
+        # one of two places at random is what a loose mark shows, where that is far enough
+        displaced = counts.displaced if shape == 'bimodal' and width > 0.01 else 0
         assert counts == PulseCounts(accepted=pulses.size - counts.unlocked,
                                      unlocked=counts.unlocked, displaced=displaced)
 
