@@ -26,13 +26,16 @@ from itertools import combinations
 from typing import Any
 
 from fault_graph import Received
-from fault_machine import (AROUND, equal_weights, exponential_weights, FloatArray, Run, TEETH,
-                           Window)
+from fault_machine import (AROUND, equal_weights, exponential_weights, FloatArray, RATE, Run,
+                           TEETH, Window)
 import numpy as np
+from sa_jitter_ros.averaging.cycle import waveform_cutoff
 from sa_jitter_ros.nodes.messages import AverageMessage
+from sa_jitter_ros.pulses.resampling import interpolate
 
 AMPLITUDE = 5e-4  # of the largest value: error of an amplitude by band-limited interpolation
-POINT = 4e-3  # the same of a point of the waveform with samples on one side only
+POINT = 4e-3  # the same of a point of the waveform
+REACH = 60  # samples on either side from which a point of the waveform may come
 BELIEVED = 0.04  # of the pitch: pulses displaced by more must not be used
 LONGEST = 60  # trigger cycles of an exponential average that are computed
 MOST_DROPPED = 3  # faults within an average that cost other teeth than their own
@@ -56,6 +59,30 @@ class Place:
     values: Mapping[str, Any]
 
 
+def edge_error(window: Window, points: int) -> float:
+    """
+    Return by how much a point of the waveform may be off because samples end there.
+
+    Interpolation continues them by point reflection. Of fewer points than samples, more of those
+    contribute.
+    """
+    run, pulses = window.run, window.pulses
+    beside = REACH / RATE
+    if (run.sent(pulses[0] - beside, pulses[0])
+            and run.sent(pulses[-1], pulses[-1] + beside)):
+        return 0.0
+    cutoff = float(waveform_cutoff(points, window.cycles, np.diff(pulses).max(), RATE))
+    samples, between = np.arange(4.0 * REACH), np.linspace(0.0, 1.0, 21)
+    error = 0.0
+    for order, amplitude, _ in run.components:
+        turns = 2.0 * np.pi * order * run.speed / RATE
+        wave, true = (np.column_stack((np.cos(turns * at), np.sin(turns * at)))
+                      for at in (samples, between))
+        off = interpolate(wave, between, cutoff=cutoff) - true
+        error += 1.3 * amplitude * float(np.hypot(*off.T).max())
+    return error
+
+
 def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
                     values: Mapping[str, Any], gain: FloatArray, allowed: float = 0.0) -> bool:
     """
@@ -76,6 +103,7 @@ def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
     if not len(whole):
         return bool(np.isnan(waveform.values).all())
     error = np.abs(waveform.values / gain - weights @ whole).max()
+    allowed += edge_error(window, waveform.values.shape[1])
     return bool(error < POINT * window.run.scale + allowed)
 
 

@@ -263,11 +263,11 @@ class PulseFollower:
         skipped = sum(marks[:-1])
         for _ in range(count - 2):
             self._drop('early')
-        lock = self._lock
-        slots = (self.slot + np.arange(skipped)) % lock.steps.size
+        slots, _ = self._passed(skipped)
         gap = self._queue[0] - self.confirmed
-        level = math.log(gap / float(lock.widths[slots].sum()))
-        self._irregular(skipped, level, 0.0, best.steps[-1].level)
+        level = math.log(gap / float(self._lock.widths[slots].sum()))
+        off = math.expm1(level - self._model.expected)  # a path that jumps miscounts them
+        self._irregular(skipped, level, off, best.steps[-1].level)
         return True
 
     def _drop_stray(self) -> None:

@@ -17,6 +17,7 @@ are true. If nothing explains ten pulses, the match is lost and a start is looke
 
 import math
 
+from sa_jitter_ros.pulses.loose_marks import LooseMarks
 from sa_jitter_ros.pulses.pulse_follower import JudgeOptions, NEAR_WHOLE, PulseFollower
 from sa_jitter_ros.pulses.pulse_start import End, new_model, PulseStart
 from sa_jitter_ros.pulses.target import Lock, Target
@@ -52,6 +53,7 @@ class PulseJudge:
         self._follower: PulseFollower | None = None
         self._end: End | None = None
         self._confirmed = -math.inf
+        self._loose = LooseMarks(self._target, self.verdicts)
 
     @property
     def confirmed(self) -> float:
@@ -75,13 +77,14 @@ class PulseJudge:
 
     def take(self, pulses: list[float]) -> None:
         """Take the next pulses in s, in order of time, none before the last one."""
-        least, last = self._options.minimum_interval, self.last
+        least, last, waited = self._options.minimum_interval, self.last, len(self._queue)
         for pulse in pulses:
             if pulse - last < least or pulse == last:
                 self.verdicts.reject(pulse, 'doubles')
             else:
                 self._queue.append(pulse)
                 last = pulse
+        self._loose.update(self._queue[waited:])
         self._run(final=False)
 
     def flush(self) -> None:
@@ -136,7 +139,7 @@ class PulseJudge:
             if number and max(abs(item - number) for item in teeth) <= NEAR_WHOLE:
                 passed = number
             known_better = end.known >= max(_KNOWN_WELL, count)
-            if known_better or scatter < _SAME_SCATTER * end.scatter:
+            if known_better or 1.0 / _SAME_SCATTER < scatter / end.scatter < _SAME_SCATTER:
                 scatter, count = end.scatter, max(count, end.known)
         self._counter.begin(first, int(lock.teeth[lock.slot]), passed=passed)
         model.start(math.log(lock.interval), scatter=scatter, count=count,

@@ -59,7 +59,8 @@ class PulseCounts:
     start a run. All others were dropped; `unlocked` ones because no steady interval was known yet.
     `relearnt` counts changes of speed within one or two intervals, `cycles_discarded` trigger
     cycles that began and were lost, `restarts` how often time ran back, `geometry_refused` how
-    often the pulses did not fit what was known of the target's marks.
+    often the pulses did not fit what was known of the target's marks. `displaced` pulses, of
+    whatever kind, are those of a loose mark (`loose_marks`).
     """
 
     accepted: int = 0
@@ -75,6 +76,7 @@ class PulseCounts:
     relearnt: int = 0
     cycles_discarded: int = 0
     geometry_refused: int = 0
+    displaced: int = 0
 
     def __add__(self, other: 'PulseCounts') -> 'PulseCounts':
         """Return the counts of both."""

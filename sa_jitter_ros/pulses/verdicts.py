@@ -28,7 +28,7 @@ class Verdicts:
     def __init__(self) -> None:
         self.counts = dict.fromkeys(
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
-             'unlocked', 'relearnt'), 0)
+             'unlocked', 'relearnt', 'displaced'), 0)
         self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
         self.messages: list[str] = []
 
