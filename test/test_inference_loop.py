@@ -19,11 +19,13 @@ import pytest
 from sa_jitter_ros.commands.close_loop import main
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.effects import declared_effects, EFFECTS, make_effect
+from sa_jitter_ros.effects.lattice import NO_CLOCK
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.beat import find_beat
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
 from sa_jitter_ros.inference.residual import residual
+from sa_jitter_ros.inference.timing import stretches
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -115,6 +117,20 @@ def test_reference_keyphasor_is_used_unless_the_source_moves_relative_to_it():
     worse = observe(swapped, MODEL)
     assert not worse.against_reference
     assert 'they give less amplitude than pulse_times' in worse.pulses.remarks[-1]
+
+
+def test_errors_of_all_stretches_are_against_the_vibration_or_all_against_the_reference(rng):
+    """The vibration resolves those before a gap only, the reference keyphasor all."""
+    whole, gap = simulated(acquisitions=6, reference=True), slice(58, 64)
+    samples = whole.read().copy()
+    after = samples[:, samples.shape[1] // 2:]
+    after += rng.normal(0.0, 3.0, after.shape)
+    recording = replace(whole, vibration=ArraySource(samples),
+                        pulse_times=np.delete(whole.pulse_times, gap),
+                        reference_pulse_times=np.delete(whole.reference_pulse_times, gap))
+    parts = stretches(observe(recording, MODEL), range(4), NO_CLOCK)
+    assert len(parts) == 2
+    assert len({part.referenced for part in parts}) == 1
 
 
 @pytest.mark.machines

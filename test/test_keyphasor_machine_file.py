@@ -110,7 +110,7 @@ RECORDINGS = [
     *((f'motor_{name}', {}) for name in ('10V_100kHz', '30V_100kHz', 'runup_20V_40kHz')),
     *((f'rotorbalancer_{name}', {'acquisition': k})
       for name in ('weight', 'weight_5', 'without_weight') for k in (0, 6)),
-    ('turbine_20130316', {}), ('turbine_20130405', {}), ('uia_bearing_rig_1', {}),
+    ('turbine_20130316', {}), ('uia_bearing_rig_1', {}),
     ('encoder_motor_slow', {})]
 
 

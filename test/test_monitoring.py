@@ -90,10 +90,10 @@ LAWS = {
 @pytest.mark.machines
 @pytest.mark.parametrize('law', LAWS)
 def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
-    shape = (40, 8)
+    shape = (80, 8)
     found, expected = alarms_of(
         LAWS[law](np.random.default_rng(7), shape), units=shape[0], quantities=shape[1],
-        learning=40, scores=2000.0, length=4000)
+        learning=40, scores=1000.0, length=2000)
     assert found <= expected + 3.0 * np.sqrt(expected)
     # each machine loses the time that its first alarm takes to build up: a third of its alarms
     assert found >= 0.5 * expected - 3.0 * np.sqrt(expected)
@@ -242,7 +242,7 @@ def test_absent_order_has_a_baseline_without_bias():
                                    {'keyphasor': 4.0, 'bias': 0.05}])
 def test_worse_keyphasor_is_no_change_of_the_machine(worse):
     alarms = []
-    for seed in range(5):
+    for seed in range(3):
         machine = Machine(20 + seed)
         monitor = machine.monitor()
         machine.run(monitor, 400)
@@ -587,15 +587,15 @@ def averages_of(rate, *, seed, seconds=50.0, damaged=False):
 
 @pytest.mark.machines
 def test_exchanged_keyphasor_of_a_simulated_gear_is_no_change_and_damage_is():
-    monitor = MachineMonitor('gear', ['input'], Settings(learning_averages=80, group_averages=4))
+    monitor = MachineMonitor('gear', ['input'], Settings(learning_averages=48, group_averages=4))
 
     def watch(**options):
         return [line for arrays in averages_of(**options) for kind in KINDS if kind in arrays
                 for line in monitor.take('input', kind, arrays[kind])]
-    assert watch(rate=20e3, seed=1) + watch(rate=20e3, seed=2) == []
+    assert watch(rate=20e3, seed=1) == []
     assert monitor.is_complete
     # order 57 keeps a fifth of its amplitude in the raw average
-    assert watch(rate=2e3, seed=3) + watch(rate=2e3, seed=4) == []
+    assert watch(rate=2e3, seed=3) == []
     lines = watch(rate=2e3, seed=5, damaged=True)
     assert any(line.startswith('order 38 of input, channel 0: +') for line in lines)
     found = {item.name: item for item in monitor.changes()}
