@@ -376,15 +376,14 @@ def main() -> None:
     parser.add_argument('--settings', type=int, default=400,
                         help='averages of a setting; 0: no table')
     options = parser.parse_args()
-    if options.settings:
-        print('\n'.join(setting_table(options.settings)), '', sep='\n', flush=True)
-    if options.trials:
-        print('\n'.join(amplitude_table(options.trials)), '', sep='\n', flush=True)
-        print('\n'.join(limit_table(options.trials)), '', sep='\n', flush=True)
-    if options.shapes:
-        print('\n'.join(shape_table(options.shapes)), '', sep='\n', flush=True)
-    if options.indicators:
-        print('\n'.join(indicator_table(options.indicators)), flush=True)
+    tables = [(options.settings, setting_table), (options.trials, amplitude_table),
+              (options.trials, limit_table), (options.shapes, shape_table),
+              (options.indicators, indicator_table)]
+    for count, table in tables:
+        if count:
+            for line in table(count):
+                print(line, flush=True)
+            print()
 
 
 if __name__ == '__main__':
