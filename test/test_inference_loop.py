@@ -11,6 +11,7 @@
 """The loop off line on simulated machines: what is observed, what is left, and what is traced."""
 
 from dataclasses import replace
+from functools import cache
 import json
 import math
 
@@ -70,10 +71,16 @@ def simulated(*effects, acquisitions=12, jitter=True, seed=3, reference=False, t
         reference_pulse_times=pulses.true_times if reference else None, description='simulated')
 
 
-def traced(*effects, model=MODEL, **options):
-    """Trace a simulated recording."""
+@cache
+def observed(*effects, model=MODEL, **options):
+    """Return the observations of a simulated recording, and the recording."""
     recording = simulated(*effects, **options)
-    return trace([observe(recording, model)], [recording])
+    return [observe(recording, model)], [recording]
+
+
+def traced(*effects, declared=(), **options):
+    """Trace a simulated recording."""
+    return trace(*observed(*effects, **options), declared=declared)
 
 
 def test_order_that_is_declared_twice_counts_once():
@@ -163,9 +170,9 @@ def test_declared_model_suffices():
 
 @pytest.fixture(scope='module')
 def fluctuating():
-    """Return a recording of a machine whose speed fluctuates, and the loop closed on it."""
-    recording = simulated(*make_effects({'speed_fluctuation': {'acceleration_std': 90.0}}))
-    return recording, trace([observe(recording, MODEL)], [recording])
+    """Return the effect of a speed that fluctuates, and the loop closed on it."""
+    effects = make_effects({'speed_fluctuation': {'acceleration_std': 90.0}})
+    return effects, traced(*effects)
 
 
 @pytest.mark.parametrize(('name', 'values', 'parameter'), [
@@ -195,9 +202,8 @@ def test_effect_on_the_mean_is_traced(name, values, parameter, request):
 
 @pytest.mark.machines
 def test_declared_speed_fluctuation_is_no_news(fluctuating):
-    recording, first = fluctuating
-    again = trace([observe(recording, MODEL)], [recording],
-                  declared=[item.effect for item in first.findings])
+    effects, first = fluctuating
+    again = traced(*effects, declared=[item.effect for item in first.findings])
     assert (first.verdict, again.verdict) == ('traced', 'none')
 
 
@@ -293,9 +299,8 @@ def test_steady_torsion_that_averages_lose_by_is_unexplained():
 
 
 def test_declared_effect_is_not_missing():
-    recording = simulated(*make_effects({'clock_skew': {'skew': 4e-4}}))
-    found = trace([observe(recording, MODEL)], [recording],
-                  declared=[make_effect('clock_skew', skew=4e-4)])
+    found = traced(*make_effects({'clock_skew': {'skew': 4e-4}}),
+                   declared=[make_effect('clock_skew', skew=4e-4)])
     assert found.verdict == 'none'
 
 
@@ -306,11 +311,9 @@ def test_declared_effect_is_not_missing():
     ('interfering_tone', {'frequency': 400.9, 'amplitude': 0.12}, 'amplitude', 0.06),
 ])
 def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, parameter, wrong):
-    recording = simulated(*make_effects({name: true}))
-    observation = observe(recording, MODEL)
-    right = trace([observation], [recording], declared=declared_effects({name: true}))
-    assert right.verdict == 'none'
-    content = report(trace([observation], [recording], declared=declared_effects(
+    made = make_effects({name: true})
+    assert traced(*made, declared=declared_effects({name: true})).verdict == 'none'
+    content = report(traced(*made, declared=declared_effects(
         {name: {**true, parameter: wrong}})))
     assert content['verdict'] == 'traced'
     changed, = [item for item in content['declared_changes'] if item['parameter'] == parameter]
@@ -331,9 +334,7 @@ def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, param
     ('phase_wander', {'std': 0.01}, 'std'),
 ])
 def test_declared_effect_that_is_not_there_is_named(name, declared, size):
-    recording = simulated()
-    content = report(trace([observe(recording, MODEL)], [recording],
-                           declared=declared_effects({name: declared})))
+    content = report(traced(declared=declared_effects({name: declared})))
     assert (content['verdict'], content['missing_effects']) == ('traced', [])
     changed, = [item for item in content['declared_changes'] if item['parameter'] == size]
     assert changed['name'] == name
@@ -342,11 +343,9 @@ def test_declared_effect_that_is_not_there_is_named(name, declared, size):
 
 @pytest.mark.machines
 def test_declared_clock_that_did_not_time_the_pulses_is_named():
-    recording = simulated()
-
     def of(rate):
         declared = declared_effects({'keyphasor_quantisation': {'clock_rate': rate}})
-        return report(trace([observe(recording, MODEL)], [recording], declared=declared))
+        return report(traced(declared=declared))
 
     content = of(2.93e3)
     assert (content['verdict'], content['missing_effects']) == ('traced', [])
@@ -369,10 +368,9 @@ def test_declared_clock_of_another_rate_is_named_though_measured_pulses_tell_the
 @pytest.mark.machines
 @pytest.mark.parametrize(('near', 'where'), [(1e-3, 'declared_changes'), (0.03, 'present')])
 def test_declared_tone_that_is_not_there_is_named(near, where):
-    recording = simulated()
     tone = (1.0 + near) * MODEL.orders[0] * MODEL.fundamental_frequency
     declared = declared_effects({'interfering_tone': {'amplitude': 0.05, 'frequency': tone}})
-    content = report(trace([observe(recording, MODEL)], [recording], declared=declared))
+    content = report(traced(declared=declared))
     found, = content[where]
     assert found['name'] == 'interfering_tone'
     assert content['missing_effects'] == []
@@ -390,9 +388,8 @@ def test_tone_beyond_its_limit_is_found():
 
 @pytest.mark.machines
 def test_declared_interpolator_that_no_beat_shows_is_taken_for_as_declared():
-    recording = simulated()
     declared = declared_effects({'interpolation_loss': {'method': 'linear'}})
-    content = report(trace([observe(recording, MODEL)], [recording], declared=declared))
+    content = report(traced(declared=declared))
     assert content['verdict'] == 'none'
     assert 'interpolation_loss' in content['undecided']
 

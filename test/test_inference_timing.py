@@ -177,8 +177,8 @@ def test_declared_machine_shows_nothing(noise):
 
 
 def test_checks_are_calibrated_on_the_declared_machine():
-    p_values = np.array([read_timing([machine(200 + seed)]).checks[i].p_value
-                         for seed in range(12) for i in (0, 4)])
+    checks = [read_timing([machine(200 + seed)]).checks for seed in range(12)]
+    p_values = np.array([each[i].p_value for each in checks for i in (0, 4)])
     assert np.mean(p_values < 0.05) < 0.2
     assert p_values.min() > 1e-4
 
@@ -226,8 +226,8 @@ def surest(checks, text):
 
 def test_source_that_moves_as_a_sine_does_is_no_random_motion():
     text = 'a sinusoid of the source'
-    random = [surest(read_timing([machine(40 + seed, wander=3.0, band=band)]).checks, text)
-              for seed in range(2) for band in ((0.0, 0.3), (0.1, 0.15))]
+    random = [surest(read_timing([machine(40, wander=3.0, band=band)]).checks, text)
+              for band in ((0.0, 0.3), (0.1, 0.15))]
     assert min(random) > 0.05 / len(random)
     timing = read_timing([machine(1, wander=6.0, band=(0.2, 0.2001))])
     assert names_of(timing) == {'phase_wander'}
