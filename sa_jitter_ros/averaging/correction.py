@@ -221,15 +221,12 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
     if len(cycles) < 2:
         return _uncorrected(raw, 'pulse errors follow from the difference between trigger cycles '
                                  'and there is one cycle: average more')
-    candidates = np.empty(0) if raw.discarded_cycles else other_lines(
-        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1], raw.orders,
-        settings.cycle_length)
-    found = _aligned(raw, cycles, settings, candidates, grids)
+    found = _aligned(raw, cycles, settings, grids)
     if isinstance(found, Correction):
         return found
-    lines = _coherent(found.average, settings, candidates)
+    lines = _coherent(found, settings)
     if lines.size:
-        again = _aligned(raw, cycles, _beside(settings, lines), np.empty(0), grids)
+        again = _aligned(raw, cycles, _beside(settings, lines), grids, search=False)
         found, lines = (found, lines[:0]) if isinstance(again, Correction) else (again, lines)
     recovery, periods = found.recovery, raw.periods
     aligned, scatter = _steady(found.average, settings, lines)
@@ -255,20 +252,24 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
 
 @dataclass(frozen=True)
 class _Aligned:
-    """The `average` between the pulses that a `recovery` expects, `refitted` of them displaced."""
+    """
+    The `average` between the pulses that a `recovery` expects, `refitted` of them displaced.
+
+    It has the orders of `candidates` for lines of other shafts, too, behind its own ones.
+    """
 
     recovery: PulseErrorRecovery
     refitted: int
+    candidates: FloatArray
     average: Average
 
 
 def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-             candidates: FloatArray, grids: LatestGrid) -> _Aligned | Correction:
+             grids: LatestGrid, *, search: bool = True) -> _Aligned | Correction:
     """
-    Recover the pulse errors and average again without them.
+    Recover the pulse errors and average again without them; `search` lines of other shafts.
 
-    The average has the orders of `candidates`, too, which the recovery does not use. A correction
-    that is not accepted is returned as it is.
+    A correction that is not accepted is returned as it is.
     """
     recovery, refitted = _refitted(raw, cycles, settings, grids)
     largest, reach = np.abs(recovery.expected).max(), _REACH * raw.periods.min()
@@ -277,7 +278,10 @@ def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings
         'cycle: check the pulses')
     if reason:
         return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
-    return _Aligned(recovery, refitted, _average_again(
+    candidates = other_lines(
+        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1], raw.orders,
+        settings.cycle_length) if search and not raw.discarded_cycles else np.empty(0)
+    return _Aligned(recovery, refitted, candidates, _average_again(
         raw, cycles, _beside(settings, candidates), raw.pulses - recovery.expected))
 
 
@@ -295,8 +299,9 @@ def _of_orders(average: Average, settings: AverageSettings) -> Average:
         cycle_amplitudes=average.cycle_amplitudes[..., :count])
 
 
-def _coherent(average: Average, settings: AverageSettings, candidates: FloatArray) -> FloatArray:
-    """Return the lines among `candidates` that an average without pulse errors still shows."""
+def _coherent(found: _Aligned, settings: AverageSettings) -> FloatArray:
+    """Return the lines among the candidates that an average without pulse errors still shows."""
+    average, candidates = found.average, found.candidates
     if not candidates.size:
         return candidates
     clean = _resampled(average, average.cycle_amplitudes, _beside(settings, candidates))[1]

@@ -29,8 +29,8 @@ ComplexArray = NDArray[np.complex128]
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32
 # Lines of the spectrum of all cycles whose median is the noise of each, how far a line is above it
-# that noise alone makes in one of a million, and the part of the sampling rate with lines.
-_BLOCK, _STANDS_OUT, _BAND = 64, 20.0, 0.4
+# that noise alone makes in one of a million, the part of the sampling rate with lines, and most.
+_BLOCK, _STANDS_OUT, _BAND, _MOST_LINES = 64, 20.0, 0.4, 256
 # A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
 # of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
 # Lengths of panels are this factor apart, so that fits up to similar orders share them.
@@ -97,8 +97,8 @@ class GridCycles:
         (line,) over the noise around, of the channel in which they are clearest.
         """
         points = self.cycles.shape[1]
-        together = max(number for number in range(1, max(int(_BAND * points / top), 1) + 1)
-                       if points % number == 0)
+        most = 2 ** int(np.log2(max(_BAND * points / top, 1.0)))  # the same for similar shafts
+        together = max(number for number in range(1, most + 1) if points % number == 0)
         if together not in self._lines:
             self._lines[together] = _standing_out(self.cycles, together)
         return self._lines[together]
@@ -134,6 +134,7 @@ def _standing_out(cycles: FloatArray, together: int) -> tuple[FloatArray, FloatA
     inside = power[1:-1]
     place = 1 + np.flatnonzero((inside > power[:-2]) & (inside >= power[2:])
                                & (inside > _STANDS_OUT))
+    place = place[np.argsort(-power[place])[:_MOST_LINES]]
     before, here, after = (np.log(power[place + shift]) for shift in (-1, 0, 1))
     off = 0.5 * (before - after) / (before - 2.0 * here + after)
     return (place + off) / count, power[place]
