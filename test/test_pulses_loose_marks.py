@@ -61,10 +61,13 @@ def test_no_other_machine_has_a_loose_mark(marks, machine):
 
 
 @pytest.mark.parametrize('marks', [1, 4])
-def test_lost_pulses_and_clocks_are_no_loose_mark(marks):
-    times = _times(5, marks)
+def test_lost_and_stray_pulses_and_clocks_are_no_loose_mark(marks):
+    times, size = _times(5, marks), 11 * marks  # pulses fitted at once
     lost = np.random.default_rng(6).random(times.size) < 0.03
     assert _said(times[~lost], marks) == ([], 0)
+    for first in range(size):  # one in all that are fitted
+        strays = times[first::size - 1] + 0.3 / SPEED / marks
+        assert _said(np.sort(np.concatenate([times, strays])), marks) == ([], 0)
     for tick in (1e-3, 3e-3):
         assert _said(np.ceil(times / tick) * tick, marks) == ([], 0)
 

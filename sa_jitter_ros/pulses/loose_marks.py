@@ -32,7 +32,7 @@ _MARKS = 4  # of more, one that is loose spoils few trigger cycles that the judg
 _TURNS, _FEWEST, _LATEST = 11, 4, 16
 _ROUNDS, _LEAST = 20, 1e-4  # of the fit, in intervals
 _BESIDE, _USUAL, _QUANTILE = 0.02, 20.0, 0.4  # in intervals, and times what most are off
-_LONGER = 0.4  # an interval of 1.6 others lacks a pulse
+_LONGER = 0.4  # an interval of 1.6 others lacks a pulse; in two of 1.4 together, one is too many
 _LOST = 0.9  # intervals by which a mark is off only if pulses were counted wrongly
 _TICKS = 1.5  # by which a clock moves a pulse in such a fit
 _SHARE = 0.08  # of the pulses of a mark, beyond those of the others
@@ -57,7 +57,7 @@ class LooseMarks:
         self._few = isinstance(target, EvenTarget) and target.marks <= _MARKS
         self._pulses: list[float] = []
         self._off: deque[FloatArray] = deque(maxlen=_LATEST)  # each (revolution, mark)
-        self._first = 0  # mark of the first pulse that waits
+        self._first = 1 % target.marks  # mark of the second pulse that waits
         self._said = False
         if self._few:
             place = np.arange(self._size)
@@ -69,21 +69,22 @@ class LooseMarks:
     def update(self, pulses: list[float]) -> None:
         """Take the next pulses (s)."""
         self._pulses += pulses if self._few else []
-        while len(self._pulses) > self._size:
-            times = np.array(self._pulses[:self._size + 1])
+        while len(self._pulses) > self._size + 1:
+            times = np.array(self._pulses[:self._size + 2])  # one on either side is not fitted
             del self._pulses[:self._size]
             intervals = np.diff(times)
             usual = float(np.median(intervals))
             if not intervals.min() > _LEAST * usual > _LEAST**2 * intervals.max():
                 continue  # out of order, or across a standstill
-            steps = int(np.maximum(np.floor(intervals / usual + _LONGER), 1.0).sum())
-            if steps == self._size:
-                off = np.abs(self._deviations((times[:-1] - times[0]) / usual))
+            steps = np.maximum(np.floor(intervals / usual + _LONGER), 1.0).astype(int)
+            shortest = float(np.min(times[2:] - times[:-2]))
+            if steps.max() == 1 and shortest > (1.0 + _LONGER) * usual:
+                off = np.abs(self._deviations((times[1:-1] - times[1]) / usual))
                 if off.max() < _LOST:
                     off -= _TICKS * clock_tick(intervals, float(times[-1])) / usual
                     self._off.append(np.roll(off.reshape(_TURNS, -1), self._first, axis=1))
                     self._look()
-            self._first = (self._first + steps) % self._marks
+            self._first = (self._first + int(steps[1:].sum())) % self._marks
 
     def _deviations(self, place: FloatArray) -> FloatArray:
         """Return how far pulses (n,) at these places are off, in intervals."""
