@@ -30,6 +30,10 @@ ComplexArray = NDArray[np.complex128]
 _LEAST_CYCLES, _MOST = 8, 16
 # Turns of a line against an order in all cycles from which on it is no slow change of the order.
 _LEAST_TURNS = 2.0
+# Turns of a line against a whole order in all cycles below which it is that order.
+_WHOLE = 0.1
+# Share of the power of a line in any order of a cycle that does not matter.
+_LEAST_SHARE = 1e-6
 # The highest line that is looked for, over the highest order.
 _HIGHEST = 2.0
 # What has so much of its power in the mirror image about an order is made by that order.
@@ -50,8 +54,12 @@ def other_lines(grid: GridCycles, orders: FloatArray, cycle_length: float) -> Fl
         return np.empty(0)
     lines, power = grid.lines(_HIGHEST * float(orders.max()) * cycle_length)
     lines, span = lines / cycle_length, count * cycle_length
+    whole = np.rint(lines)  # an order of the shaft that is not asked for is known exactly
+    lines = np.where(np.abs(lines - whole) * span < _WHOLE, whole, lines)
     own = np.concatenate((orders, -orders))
-    leaked = power * np.max(np.sinc(cycle_length * np.abs(lines[:, None] - own)) ** 2, axis=1)
+    share = np.max(np.sinc(cycle_length * np.abs(lines[:, None] - own)) ** 2, axis=1)
+    lines, power, share = (item[share > _LEAST_SHARE] for item in (lines, power, share))
+    leaked = power * share
     mirrored = np.abs(2.0 * orders[:, None, None] - lines[:, None] - lines) * span < 1.0
     alone = ~np.any(mirrored & (power > _MIRRORED * power[:, None]), axis=(0, 2))
     found = np.empty(0)
@@ -71,17 +79,14 @@ def coherent(lines: FloatArray, cycles: ComplexArray, cycle_length: float) -> Fl
     line keeps its amplitude from cycle to cycle, and turns by what its order is off.
     """
     count, channels, _ = cycles.shape
-    step = np.arange(-_STEPS, _STEPS + 1) / (2.0 * _STEPS * count)
-    waves = np.exp(-2j * np.pi * np.multiply.outer(step, np.arange(count)))
-    sums = np.abs(np.tensordot(waves, cycles, axes=1)) ** 2 / count
-    power = np.sum(sums, axis=1)
-    best = np.clip(np.argmax(power, axis=0), 1, 2 * _STEPS - 1)
-    place = np.arange(lines.size)
-    before, here, after = (power[best + shift, place] for shift in (-1, 0, 1))
-    bend = before - 2.0 * here + after
-    off = np.clip(0.5 * (before - after) / np.where(bend < 0.0, bend, -np.inf), -1.0, 1.0)
-    steady = sums[best, :, place].T
+    known, off = lines == np.rint(lines), np.zeros(lines.size)
+    for width in (1.0, 0.1):  # of the search, in lines of the spectrum of all cycles
+        step = width * np.arange(-_STEPS, _STEPS + 1) / (2.0 * _STEPS * count)
+        waves = np.exp(-2j * np.pi * (off + step[:, None]) * np.arange(count)[:, None, None])
+        sums = np.abs(np.einsum('ksl,kcl->scl', waves, cycles)) ** 2 / count
+        best = np.where(known, _STEPS, np.argmax(np.sum(sums, axis=1), axis=0))
+        off = off + step[best]
+    steady = sums[best, :, np.arange(lines.size)].T
     scatter = np.maximum(np.sum(np.abs(cycles) ** 2, axis=0) - steady, np.finfo(float).tiny)
     level = np.expm1(np.log(channels * lines.size / _FALSE_ALARM) / (count - 1.0))
-    clear = np.any(steady > level * scatter, axis=0)
-    return np.asarray(lines + (step[best] + off * (step[1] - step[0])) / cycle_length)[clear]
+    return np.asarray((lines + off / cycle_length)[np.any(steady > level * scatter, axis=0)])
