@@ -28,9 +28,11 @@ ComplexArray = NDArray[np.complex128]
 
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32
+# The part of the sampling rate in which lines and orders are searched.
+BAND = 0.4
 # Lines of the spectrum of all cycles whose median is the noise of each, how far a line is above it
-# that noise alone makes in one of a million, the part of the sampling rate with lines, and most.
-_BLOCK, _STANDS_OUT, _BAND, _MOST_LINES = 64, 20.0, 0.4, 256
+# that noise alone makes in one of a million, and most lines.
+_BLOCK, _STANDS_OUT, _MOST_LINES = 64, 20.0, 256
 # A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
 # of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
 # Lengths of panels are this factor apart, so that fits up to similar orders share them.
@@ -97,7 +99,7 @@ class GridCycles:
         (line,) over the noise around, of the channel in which they are clearest.
         """
         points = self.cycles.shape[1]
-        most = 2 ** int(np.log2(max(_BAND * points / top, 1.0)))  # the same for similar shafts
+        most = 2 ** int(np.log2(max(BAND * points / top, 1.0)))  # the same for similar shafts
         together = max(number for number in range(1, most + 1) if points % number == 0)
         if together not in self._lines:
             self._lines[together] = _standing_out(self.cycles, together)
@@ -126,7 +128,7 @@ def _standing_out(cycles: FloatArray, together: int) -> tuple[FloatArray, FloatA
     flat = cycles.reshape(count * points // together, together, channels).mean(axis=1)
     window = np.sin(pi * (np.arange(len(flat)) + 0.5) / len(flat)) ** 2
     spectrum = rfft((flat - flat.mean(axis=0)) * window[:, None], axis=0)
-    power = np.abs(spectrum[:int(_BAND * len(flat))]) ** 2
+    power = np.abs(spectrum[:int(BAND * len(flat))]) ** 2
     blocks = np.array_split(power, max(len(power) // _BLOCK, 1))
     floor = np.concatenate([np.broadcast_to(np.median(block, axis=0), block.shape)
                             for block in blocks])

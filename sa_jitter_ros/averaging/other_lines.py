@@ -22,6 +22,7 @@ cycles; so do those that pulse errors make beside an order, on both of its sides
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
+from sa_jitter_ros.averaging.synchronous_orders import significance
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -38,8 +39,6 @@ _LEAST_SHARE = 1e-6
 _HIGHEST = 2.0
 # What has so much of its power in the mirror image about an order is made by that order.
 _MIRRORED = 0.25
-# Probability that noise alone passes for a line.
-_FALSE_ALARM = 1e-3
 _STEPS = 16  # places between two lines of the spectrum at which the order of a line is refined
 
 
@@ -59,11 +58,11 @@ def other_lines(grid: GridCycles, orders: FloatArray, cycle_length: float) -> Fl
     own = np.concatenate((orders, -orders))
     share = np.max(np.sinc(cycle_length * np.abs(lines[:, None] - own)) ** 2, axis=1)
     lines, power, share = (item[share > _LEAST_SHARE] for item in (lines, power, share))
-    leaked = power * share
+    by_leakage = np.argsort(-power * share)
     mirrored = np.abs(2.0 * orders[:, None, None] - lines[:, None] - lines) * span < 1.0
     alone = ~np.any(mirrored & (power > _MIRRORED * power[:, None]), axis=(0, 2))
     found = np.empty(0)
-    for line in lines[np.argsort(-leaked)][alone[np.argsort(-leaked)]]:
+    for line in lines[by_leakage][alone[by_leakage]]:
         if np.all(np.abs(line - np.append(own, found)) * span >= _LEAST_TURNS):
             found = np.append(found, line)
         if found.size == _MOST:
@@ -88,5 +87,5 @@ def coherent(lines: FloatArray, cycles: ComplexArray, cycle_length: float) -> Fl
         off = off + step[best]
     steady = sums[best, :, np.arange(lines.size)].T
     scatter = np.maximum(np.sum(np.abs(cycles) ** 2, axis=0) - steady, np.finfo(float).tiny)
-    level = np.expm1(np.log(channels * lines.size / _FALSE_ALARM) / (count - 1.0))
+    level = significance(channels * lines.size, count) / (count - 1.0)
     return np.asarray((lines + off / cycle_length)[np.any(steady > level * scatter, axis=0)])

@@ -26,7 +26,7 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.grid_cycles import cycle_weights, GridCycles
+from sa_jitter_ros.averaging.grid_cycles import BAND, cycle_weights, GridCycles
 from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, PulseErrorProblem,
@@ -79,7 +79,7 @@ class LineSearch:
 
         `additional_orders` are searched besides the integer ones.
         """
-        top = 0.4 * grid.cycles.shape[1] / cycle_length
+        top = BAND * grid.cycles.shape[1] / cycle_length
         others = [g for g in additional_orders if 0.0 < g <= top]
         orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
         used = slice(grid.first, grid.first + grid.spectra.shape[1])
@@ -130,7 +130,7 @@ class LineSearch:
         scatter = np.maximum(np.sum(np.abs(series - mean[:, None]) ** 2, axis=1) / (count - 1),
                              np.finfo(float).tiny)
         power = np.abs(mean) ** 2 - scatter / count
-        limit = _significance(len(self.orders) * series.shape[2], cycles)
+        limit = significance(len(self.orders) * series.shape[2], cycles)
         return np.asarray((cycles * power > _FAR_BELOW * limit * scatter).any(axis=1))
 
     def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
@@ -205,7 +205,7 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     power = np.abs(amplitudes) ** 2
     scatter = np.sum(np.abs(deviation) ** 2, axis=0) / (count - 1)
     ringing = np.maximum(scatter, 2.0 * long_run_variance(in_phase))
-    limit = _significance(tests * channels, count)
+    limit = significance(tests * channels, count)
     return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
 
@@ -290,7 +290,7 @@ def _shares(series: FloatArray, turning: tuple[ComplexArray, ComplexArray], line
     return np.asarray(np.clip(np.mean(power / whole, axis=1), 0.0, 1.0))
 
 
-def _significance(tests: int, cycles: int) -> float:
+def significance(tests: int, cycles: int) -> float:
     """Return the level of the F test of one of so many orders and channels."""
     # of 2 and 2 k degrees of freedom the probability above f is (1 + f / k)^-k
     return float((cycles - 1) * np.expm1(np.log(tests / _FALSE_ALARM) / (cycles - 1)))
