@@ -100,6 +100,16 @@ def names_of(report: Report) -> list[str]:
     return [item['name'] for item in report.get('missing_effects') or ()]
 
 
+def stated(report: Report, expected: Expected) -> list[tuple[float, bool]]:
+    """Return each probability that a report states, and whether the effect is there."""
+    declared = (report.get('declared') or {}).get('effects') or {}
+    some = frozenset(chain.from_iterable(expected.effects))
+    every = some.intersection(*expected.effects)
+    unsure = expected.optional | (some - every) | frozenset(declared)
+    return [(value, name in every) for name, value in (report.get('probabilities') or {}).items()
+            if name not in unsure]
+
+
 def judge(answer: Answer, expected: Expected) -> Judgement:
     """Compare an answer with what must come out."""
     if answer.crash:

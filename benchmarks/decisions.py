@@ -25,6 +25,7 @@ import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 import json
 import os
 from pathlib import Path
@@ -35,7 +36,8 @@ import sys
 import tempfile
 from typing import Any
 
-from decision_judge import Answer, count, decision, judge, Judgement, mcnemar, names_of, OUTCOMES
+from decision_judge import (
+    Answer, count, decision, judge, Judgement, mcnemar, names_of, OUTCOMES, stated)
 from decision_machines import Row, rows
 from decision_outside import Absent
 from decision_own import Drawn
@@ -46,6 +48,8 @@ from scipy import stats
 PUBLISHED = Path(__file__).with_suffix('.json')
 _ROOT = Path(__file__).resolve().parents[1]
 _WALL = 10.0 * LIMIT  # s, for a worker that does not count its time
+_LEVELS = 0.05, 0.25, 0.5, 0.75, 0.95
+_BINS = 0.0, 0.01, 0.1, 0.5, 0.9, 1.1
 
 Result = Mapping[str, Any]
 
@@ -106,7 +110,8 @@ def result(row: Row, worker: Worker | None = None) -> Result:
             found = worker.ask(job)
         else:
             found = Answer(**answer(**job))
-    return _line(row, found, judge(found, drawn.expected))
+    return {**_line(row, found, judge(found, drawn.expected)),
+            'stated': stated(found.report, drawn.expected)}
 
 
 def _line(row: Row, found: Answer, judged: Judgement) -> Result:
@@ -230,14 +235,29 @@ def _title(row: Result, by: str) -> str:
 
 
 def _probabilities(found: Sequence[Result]) -> str:
-    """Return whether the p values of machines that are as declared are even."""
-    values = [row['p_value'] for row in found if row['p_value'] is not None and row['right']
-              and row['verdict'] == 'none' and not row['present']]
-    if len(values) < 2:
-        return 'p values of right machines without an effect: fewer than two are stated.'
-    even = stats.kstest(values, 'uniform').pvalue
-    return (f'p values of right machines without an effect: {sum(p >= 0.95 for p in values)} of '
-            f'{len(values)} are 0.95 or more; the probability that they are even is {even:.2g}.')
+    """Return whether the p values of right reports are even, and how often effects are there."""
+    lines = []
+    for verdict in ('none', 'traced'):
+        values = [row['p_value'] for row in found if row['p_value'] is not None and row['right']
+                  and row['verdict'] == verdict]
+        if len(values) > 1:
+            even = stats.kstest(values, 'uniform').pvalue
+            shares = ', '.join(f'{np.mean(np.array(values) <= p):.2f}' for p in _LEVELS)
+            lines.append(f'{len(values)} p values of right `{verdict}`: {shares} are at most '
+                         f'{", ".join(map(str, _LEVELS))}; Kolmogorov-Smirnov p {even:.2g}')
+    pairs = [pair for row in found for pair in row.get('stated') or ()]
+    if pairs:
+        stated_, there = np.array(pairs, float).T
+        lines += [f'{there.size} probabilities of effects, Brier score '
+                  f'{np.mean((stated_ - there) ** 2):.2g} '
+                  f'({np.mean(there) * (1.0 - np.mean(there)):.2g} by their share alone)', '',
+                  '| stated | effects | mean stated | there |', '|---|---|---|---|']
+        for low, high in pairwise(_BINS):
+            here = (stated_ >= low) & (stated_ < high)
+            if here.any():
+                lines.append(f'| {low:g} to {min(high, 1.0):g} | {here.sum()} | '
+                             f'{stated_[here].mean():.2g} | {there[here].mean():.2g} |')
+    return '\n'.join(lines)
 
 
 def publish(options: argparse.Namespace) -> int:

@@ -10,6 +10,7 @@
 
 """What the loop takes as evidence: noise that is no line, pulses that are counted, ticks."""
 
+from dataclasses import replace
 import math
 
 from decision_independent import independent
@@ -18,10 +19,15 @@ from decisions import stored
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.noise import noise_floor
+from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.lattice import placed_on_grid, ticks_leave_room, within_half_tick
 from sa_jitter_ros.inference.beat import find_beat, without_beat
+from sa_jitter_ros.inference.benches import make_bench
+from sa_jitter_ros.inference.expectation import Memory
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
+from sa_jitter_ros.inference.refinements import with_its_ticks
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -175,6 +181,20 @@ def test_what_ticks_hide_of_the_motion_is_no_other_effect(quantised):
     assert found.verdict == 'none'
     assert found.after.rms < 0.3 * found.as_declared.rms
     assert 0.2 < found.after.chi2_per_dof < 3.0
+
+
+def test_ticks_that_tell_nothing_of_the_errors_are_left_out(quantised, rng):
+    recording, model = quantised
+    observation = observe(recording, model)
+    bench = make_bench(observation, [observation], [recording], ())
+    ticks = Finding('keyphasor_quantisation', make_effect(
+        'keyphasor_quantisation', clock_rate=model.keyphasor_rate), {}, 0.0, '')
+    refined, found, *_ = with_its_ticks(bench, [ticks], [])
+    assert [item.name for item in found] == [ticks.name]
+    assert [item.name for item in refined.declared] == [ticks.name]
+    mixed = replace(bench, memory=Memory(), pulses=[[replace(
+        item, errors=rng.permutation(item.errors)) for item in rows] for rows in bench.pulses])
+    assert with_its_ticks(mixed, [ticks], []) == (mixed, [], [], [])
 
 
 def test_loop_is_repeatable(quantised):

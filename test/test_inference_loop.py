@@ -189,10 +189,12 @@ def test_effect_on_the_mean_is_traced(name, values, parameter, request):
     content = report(found)
     assert content['verdict'] == 'traced'
     assert [item['name'] for item in content['missing_effects']] == [name]
-    assert found.probabilities.keys() == EFFECTS.keys()
-    assert found.probabilities[name] > 0.9
-    assert all(0.0 <= item <= 1.0 for item in found.probabilities.values())
-    assert content['probabilities'] is None  # they are not calibrated
+    stated = content['probabilities']
+    assert stated.keys() == EFFECTS.keys() - {item['name'] for item in content['not_testable']}
+    assert {other for other, value in stated.items() if value > 0.9} == {name}
+    assert all(0.0 <= item <= 1.0 for item in stated.values())
+    assert content['error_before']['p_value'] < 0.01
+    assert content['error_after']['p_value'] > 1e-3
     fitted = content['missing_effects'][0]['parameters'][parameter]
     assert abs(fitted['value'] - values[parameter]) < 4.0 * fitted['standard_error']
     before, after = content['error_before']['rms'], content['error_after']['rms']
@@ -505,13 +507,32 @@ def test_residual_of_what_is_predicted_is_chance(rng):
                         probability)
 
     right, wrong = of(0.0), of(0.03)
-    assert right.p_value > 0.01
+    assert not right.significant
     assert right.chi2_per_dof == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / draws.size))
     assert right.ks < 1.63 / np.sqrt(draws.size)
     assert right.coverage == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / draws.size))
     assert wrong.rms == pytest.approx(0.03, abs=4.0 * 0.02 / np.sqrt(30))
+    assert wrong.significant
     assert wrong.p_value < 1e-3
     assert wrong.score < right.score
+
+
+def test_p_value_is_even_whatever_lines_have_in_common(rng):
+    """Lines share the errors of the pulses, and scatter by what the prediction says."""
+    values = []
+    for _ in range(300):
+        count, lines = int(rng.integers(4, 15)), int(rng.integers(1, 9))
+        scale = rng.uniform(1e-3, 0.05, lines)
+        own = rng.uniform(0.0, 1.0)
+        shared = rng.standard_normal((count, 1))
+        z = np.sqrt(own) * rng.standard_normal((count, lines)) + np.sqrt(1.0 - own) * shared
+        predicted, variance = np.full(z.shape, 0.9), np.broadcast_to(scale**2, z.shape)
+        draws = predicted + scale * z
+        values.append(residual(draws, predicted, variance, draws, predicted, variance,
+                               stats.norm.cdf(z)).p_value)
+    assert stats.kstest(values, 'uniform').pvalue > 0.01
+    one = residual(*(np.ones((1, 3)) for _ in range(7)))
+    assert np.isnan(one.p_value)
 
 
 def test_added_jitter_and_slower_clock_make_the_old_pulses_the_reference():

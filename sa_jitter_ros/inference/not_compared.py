@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import absent, DirectEffect, effects_of, Finding
+from sa_jitter_ros.effects.effect import DirectEffect, effects_of, Finding
 from sa_jitter_ros.effects.lattice import NO_CLOCK
 from sa_jitter_ros.inference.benches import few_of, parted
 from sa_jitter_ros.inference.candidates import Candidate, candidates_of_lines
@@ -88,7 +88,9 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     open_ = [row.name for row in rows if row.upper is None and row.lower is None]
     undecided = tuple(row.name for row in rows if row.name in {
         *open_, *undecided_effects(by_how_much, declared, rows)})
-    tested = {*(item.name for item in found), *(item.name for item in tried)}
+    names = [item.name for item in found]
+    tested = {*names, *(item.name for item in tried)}
+    not_testable = {name: reason for name in EFFECTS if name not in tested}
     left_over = unexplained_text(observation, most, harmful, unsteady)
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
@@ -96,10 +98,8 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
         np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None,
         'unexplained' if left_over else 'traced' if found else 'none', float('nan'),
         None, None, rows, undecided,
-        {**{row.name: absent(row.name, UNSEEN).probability for row in rows},
-         **probabilities(None, tried), **{item.name: item.probability for item in found}},
-        reason, noise, gain=gained, remains=left_over, unsteady=unsteady,
-        not_testable={name: reason for name in EFFECTS if name not in tested},
+        probabilities(tried, None, names, not_testable), reason, noise, gain=gained,
+        remains=left_over, unsteady=unsteady, not_testable=not_testable,
         clock=NO_CLOCK if bench is None else bench.clock)
 
 

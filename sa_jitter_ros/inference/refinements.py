@@ -45,8 +45,9 @@ def with_its_ticks(bench: Bench, chosen: list[Finding], present: list[Finding]
     Return the bench with the ticks of the declared clock, these, and the other findings.
 
     A keyphasor that is sampled at the declared rate has them: they are no effect that the declared
-    model lacks. Where acquisitions are predicted worse with them, beside the effects that were
-    chosen, they are left out.
+    model lacks. They are left out unless acquisitions are predicted better with them, beside the
+    effects that were chosen: where the shaft moves by more than a tick from pulse to pulse, they
+    tell too little of the errors.
     """
     ticks = [item for item in (*chosen, *present)
              if isinstance(item.effect, KeyphasorQuantisation)
@@ -58,6 +59,6 @@ def with_its_ticks(bench: Bench, chosen: list[Finding], present: list[Finding]
     chosen, present = ([item for item in items if item not in ticks]
                        for items in (chosen, present))
     own = refined.unsteadiness(effects_of(chosen))
-    worse = score_gain(*(predicting(item, own)(chosen) for item in (bench, refined)),
-                       of_mean=True).worse
-    return (bench, [], chosen, present) if worse else (refined, ticks, chosen, present)
+    gain = score_gain(*(predicting(item, own)(chosen) for item in (bench, refined)), of_mean=True)
+    better = gain.log_score > 0.0 and not gain.worse
+    return (refined, ticks, chosen, present) if better else (bench, [], chosen, present)

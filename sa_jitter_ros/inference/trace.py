@@ -184,6 +184,7 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     attenuation, _, amplitude = scores.bench.observed(everything)
     rows = limits(timing, evidence, [item.name for item in (*chosen, *present, *refinements)])
     assumed = [item.name for item in bench.assumed]
+    not_testable = {**bench.unidentifiable, **_without_timing(timing)}
     candidates += _not_tried(bench, timing, candidates, known)
     final = tuple(_on_all(bench, whole, [*chosen, *present, *refinements]))
     few, own = partial(bench.change, chosen=few_of(bench)), scores.unsteadiness
@@ -195,9 +196,9 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
         scores.bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if left_over else 'traced' if chosen else 'none', own, timing, left,
         rows, (*undecided_effects(few, effects, rows), *assumed),
-        probabilities(timing, candidates), '', noise, final[len(chosen) + len(present):],
-        as_declared, gained, left_over, unsteady,
-        {**bench.unidentifiable, **_without_timing(timing)}, bench.clock)
+        probabilities(candidates, timing, [item.name for item in chosen], not_testable), '', noise,
+        final[len(chosen) + len(present):], as_declared, gained, left_over, unsteady, not_testable,
+        bench.clock)
 
 
 def _of_findings(chosen: Sequence[Finding], present: Sequence[Finding],

@@ -10,7 +10,7 @@
 
 """Effects that may be there unseen, and are large enough to change an average."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 import math
 
 import numpy as np
@@ -27,6 +27,8 @@ from sa_jitter_ros.prediction.prediction import predict
 #: The largest change that an effect beside others makes.
 Change = Callable[[Sequence[Effect], Effect], float]
 _UNDECIDED = 1e-2  # change of an average by what may be there
+# Shares of effects that are there, in the open half of the table of decisions.
+_NAMED, _NOT_NAMED, _NOWHERE = 0.98, 0.02, 7e-4
 
 
 def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[EffectLimit]
@@ -61,7 +63,16 @@ def published_change(observation: Observation, without: Sequence[Effect],
                      for name in ('mean_attenuation', 'standard_deviation')))
 
 
-def probabilities(timing: Timing | None, candidates: Sequence[Candidate]) -> Mapping[str, float]:
-    """Return the probability of every effect that was tried."""
-    found = dict(timing.probabilities) if timing is not None else {}
-    return {item.name: item.finding.probability for item in candidates} | found
+def probabilities(candidates: Sequence[Candidate], timing: Timing | None, named: Iterable[str],
+                  not_testable: Collection[str]) -> Mapping[str, float]:
+    """
+    Return the probability that the declared model lacks an effect, of all that could be seen.
+
+    The odds among sets of effects hold if one of these sets is true. How often an effect is there
+    that was named, or that has these odds and was not named, is counted.
+    """
+    odds = {item.name: item.finding.probability for item in candidates}
+    odds |= timing.probabilities if timing is not None else {}
+    found = {name: _NOWHERE + _NOT_NAMED * value for name, value in odds.items()}
+    found |= dict.fromkeys(named, _NAMED)
+    return {name: value for name, value in found.items() if name not in not_testable}

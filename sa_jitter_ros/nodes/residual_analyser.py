@@ -202,7 +202,7 @@ class ResidualAnalyser(MonitoringNode):
             'averager, or use a better keyphasor'))
         self._batch.averages.clear()
         self._batches += 1
-        self._significant = found.p_value < _SIGNIFICANT
+        self._significant = found.p_surest < _SIGNIFICANT
         self._residual.publish(encode_residual(ResidualMessage(
             table, len(averages), found.chi2_per_dof, found.p_value, found.rms)))
         return averages

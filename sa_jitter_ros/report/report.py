@@ -79,7 +79,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'limits': [{'name': item.name, 'parameter': item.parameter, 'upper_95': item.upper,
                     'lower_95': item.lower, 'unit': item.unit} for item in trace.limits],
         'undecided': list(trace.undecided),
-        'probabilities': None,
+        'probabilities': trace.probabilities,
         'declared_changes': _changes(trace),
         'candidates': [_candidate(item) for item in trace.candidates],
         'error_before': errors(trace.before),
@@ -108,7 +108,7 @@ def errors(item: Residual) -> Mapping[str, Json]:
         'cramer_von_mises': item.cramer_von_mises, 'coverage_95': item.coverage,
         'mean': item.mean.mean() if item.mean.size else None,
         'rms_standard_error': item.rms_standard_error,
-        'rms_parameter_error': item.rms_parameter_error, 'p_value': None}
+        'rms_parameter_error': item.rms_parameter_error, 'p_value': item.p_value}
 
 
 def summary(content: Mapping[str, Json]) -> str:
