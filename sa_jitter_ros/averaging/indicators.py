@@ -237,11 +237,12 @@ def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
         weight[-1] = 1.0 / points
     difference = np.fft.irfft(
         np.where(lines.mesh | lines.shaft | lines.sidebands, 0.0, spectrum), points)
+    residual = difference
+    if lines.sidebands.any():
+        residual = difference + np.fft.irfft(np.where(lines.sidebands, spectrum, 0.0), points)
     return GearSignals(
-        regular=samples - difference,
-        residual=difference + np.fft.irfft(np.where(lines.sidebands, spectrum, 0.0), points),
-        difference=difference, amplitudes=weight * np.abs(spectrum),
-        spectrum=spectrum, lines=lines)
+        regular=samples - difference, residual=residual, difference=difference,
+        amplitudes=weight * np.abs(spectrum), spectrum=spectrum, lines=lines)
 
 
 @dataclass(frozen=True)
