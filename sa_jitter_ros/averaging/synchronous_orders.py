@@ -28,9 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import BAND, cycle_weights, GridCycles
 from sa_jitter_ros.averaging.noise import long_run_variance
-from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
-                                                     least_squares, PulseErrorProblem,
-                                                     real_parts)
+from sa_jitter_ros.averaging.pulse_error_fit import CompressedCycles, PulseErrorProblem
 from scipy.fft import fft, rfft
 from scipy.ndimage import median_filter
 from scipy.special import betainc
@@ -217,9 +215,10 @@ def _deviations(model: CompressedCycles, errors: FloatArray, chosen: NDArray[np.
 
     The deviations (cycle, order, channel) are also given in phase with the amplitudes.
     """
-    signal = model.response(errors, chosen).signal
-    amplitudes = least_squares(signal, model.coefficients)
-    found = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
+    response, amplitudes, rest = model.fitted(errors, chosen)
+    parts = np.matmul(response.signal.transpose(0, 2, 1), rest)
+    parts /= np.sum(response.signal**2, axis=1)[:, :, None]
+    found = parts[:, :len(amplitudes)] + 1j * parts[:, len(amplitudes):]
     return amplitudes, found, (found * np.exp(-1j * np.angle(amplitudes))).real
 
 
@@ -233,7 +232,7 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
     that are left of each order, in the channels where it is significant. Whole turns and the sign
     of the rate do not show: of the largest tone, the four nearest orders are returned.
     """
-    model, chosen, numbers = problem.model, problem.chosen, problem.model.numbers
+    model, chosen, numbers = problem.model, problem.chosen, problem.model.grid.numbers
     count, orders = len(numbers), model.orders[chosen]
     if count < _LEAST_CYCLES:
         return np.empty(0)
