@@ -226,8 +226,9 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
         return found
     lines = _coherent(found, settings)
     if lines.size:
-        again = _aligned(raw, cycles, _beside(settings, lines), grids, search=False)
-        found, lines = (found, lines[:0]) if isinstance(again, Correction) else (again, lines)
+        again = _aligned(raw, cycles, settings, grids, known=(found.recovery.orders, lines))
+        found, lines = (found, lines[:0]) if isinstance(again, Correction) else (
+            again, _coherent(again, settings))
     recovery, periods = found.recovery, raw.periods
     aligned, scatter = _steady(found.average, settings, lines)
     corrected = _of_orders(found.average, settings)
@@ -265,22 +266,25 @@ class _Aligned:
 
 
 def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-             grids: LatestGrid, *, search: bool = True) -> _Aligned | Correction:
+             grids: LatestGrid, *,
+             known: tuple[FloatArray, FloatArray] | None = None) -> _Aligned | Correction:
     """
-    Recover the pulse errors and average again without them; `search` lines of other shafts.
+    Recover the pulse errors and average again without them.
 
-    A correction that is not accepted is returned as it is.
+    They are recovered from orders and lines of other shafts that are `known`; else these are
+    looked for. A correction that is not accepted is returned as it is.
     """
-    recovery, refitted = _refitted(raw, cycles, settings, grids)
+    orders = () if known is None else np.unique(np.concatenate((raw.orders, *known))).tolist()
+    recovery, refitted = _refitted(raw, cycles, settings, grids, orders)
     largest, reach = np.abs(recovery.expected).max(), _REACH * raw.periods.min()
     reason = recovery.reason if largest <= reach else (
         f'a pulse error of {largest:.3g} s is above {reach:.3g} s, {_REACH:.0%} of a trigger '
         'cycle: check the pulses')
     if reason:
         return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
-    candidates = other_lines(
-        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1], raw.orders,
-        settings.cycle_length) if search and not raw.discarded_cycles else np.empty(0)
+    candidates = known[1] if known else other_lines(
+        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1],
+        recovery.expected / np.mean(raw.periods), raw.orders, settings.cycle_length)
     return _Aligned(recovery, refitted, candidates, _average_again(
         raw, cycles, _beside(settings, candidates), raw.pulses - recovery.expected))
 
@@ -305,7 +309,8 @@ def _coherent(found: _Aligned, settings: AverageSettings) -> FloatArray:
     if not candidates.size:
         return candidates
     clean = _resampled(average, average.cycle_amplitudes, _beside(settings, candidates))[1]
-    lines = coherent(candidates, clean[..., len(settings.orders):], settings.cycle_length)
+    lines = coherent(candidates, clean[..., len(settings.orders):], average.cycle_numbers,
+                     settings.cycle_length)
     while lines.size and not leaks_apart(
             _beside(settings, lines).orders, settings.cycle_length, len(clean)):
         lines = lines[:-1]
@@ -400,13 +405,13 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
 
 
 def _refitted(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-              grids: LatestGrid) -> tuple[PulseErrorRecovery, int]:
+              grids: LatestGrid, orders: Sequence[float]) -> tuple[PulseErrorRecovery, int]:
     """
     Recover the pulse errors, where needed again without the pulses that no jitter explains.
 
     The second result is the number of these.
     """
-    recovery, grid = _recovered(raw, cycles, settings, grids)
+    recovery, grid = _recovered(raw, cycles, settings, grids, orders)
     begins = np.flatnonzero(raw.used)
     moved = np.zeros(raw.pulses.size)
     for _ in range(_ROUNDS):
@@ -423,7 +428,7 @@ def _refitted(raw: Average, cycles: list[CycleSamples], settings: AverageSetting
             return recovery, 0
         again = replace(raw, pulses=raw.pulses - moved)
         recovery, grid = _recovered(
-            again, _between(raw, cycles, again.pulses), settings, grids)
+            again, _between(raw, cycles, again.pulses), settings, grids, orders)
     if not moved.any():
         return recovery, 0
     shift = moved - moved.mean()
@@ -437,13 +442,14 @@ def _declared(cycles: Sequence[CycleSamples], settings: AverageSettings) -> floa
 
 
 def _recovered(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-               grids: LatestGrid) -> tuple[PulseErrorRecovery, FloatArray]:
+               grids: LatestGrid, orders: Sequence[float]
+               ) -> tuple[PulseErrorRecovery, FloatArray]:
     """Recover the errors of the pulses of `raw` from its trigger `cycles`; return both."""
     # The recovery is a model of the linear law, whatever law the settings have.
     grid, seen, informative = grids.of(cycles, settings.interpolation, raw.cycle_numbers)
     found = recover_pulse_errors(
         seen, periods=raw.periods, cycle_length=settings.cycle_length,
-        first_angle=raw.first_angle, additional_orders=settings.orders,
+        first_angle=raw.first_angle, orders=orders, additional_orders=settings.orders,
         declared_standard_deviation=_declared(cycles, settings))
     return _of_all_channels(found, informative), grid
 

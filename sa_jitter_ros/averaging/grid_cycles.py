@@ -21,6 +21,7 @@ from math import pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import rfft
 
 FloatArray = NDArray[np.float64]
@@ -55,12 +56,17 @@ class GridCycles:
         self.begins = np.arange(len(self.cycles))
         self.begins[1:] += np.cumsum(np.diff(self.numbers) > 1)
         self._compact: dict[int, FloatArray] = {}
-        self._lines: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._means: dict[int, FloatArray] = {}
 
     @property
     def pulses(self) -> int:
         """Return the number of pulses between which the cycles lie."""
         return int(self.begins[-1]) + 2
+
+    @property
+    def span(self) -> int:
+        """Return the number of cycles with those at gaps."""
+        return int(self.numbers[-1]) + 1
 
     @cached_property
     def samples(self) -> FloatArray:
@@ -91,19 +97,29 @@ class GridCycles:
             spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
         return spectra
 
-    def lines(self, top: float) -> tuple[FloatArray, FloatArray]:
+    def lines(self, top: float, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """
         Return the lines up to `top`, or more, that stand out in the spectrum of all cycles.
 
-        They are in cycles in a trigger cycle, below 0.4 of the sampling rate, with their power
-        (line,) over the noise around, of the channel in which they are clearest.
+        Pulse `errors` (pulse,), in trigger cycles, are removed from the angle. Lines are in cycles
+        in a trigger cycle, below 0.4 of the sampling rate, with their power (line,) over the noise
+        around, of the channel in which they are clearest.
         """
-        points = self.cycles.shape[1]
+        count, points, channels = self.cycles.shape
         most = 2 ** int(np.log2(max(BAND * points / top, 1.0)))  # the same for similar shafts
         together = max(number for number in range(1, most + 1) if points % number == 0)
-        if together not in self._lines:
-            self._lines[together] = _standing_out(self.cycles, together)
-        return self._lines[together]
+        if together not in self._means:
+            means = self.cycles.reshape(count, -1, together, channels).mean(axis=2)
+            whole = np.zeros((self.span, *means.shape[1:]))
+            whole[self.numbers] = means - means.mean(axis=(0, 1))
+            self._means[together] = whole.reshape(-1, channels)
+        flat = self._means[together]
+        ends = np.stack((self.begins, self.begins + 1), axis=1)
+        knots = self.numbers[:, None] + np.arange(2.0)
+        place = np.interp(np.arange(len(flat)) * (self.span / len(flat)),
+                          (knots + errors[ends]).ravel(), knots.ravel())
+        flat = interpolate(flat, np.minimum(place * (len(flat) / self.span), len(flat) - 1.0))
+        return _standing_out(flat, self.span)
 
     def compact(self, rows: FloatArray, cycles: float) -> tuple[FloatArray, FloatArray]:
         """
@@ -122,12 +138,10 @@ class GridCycles:
         return _in_panels(rows, length), self._compact[length]
 
 
-def _standing_out(cycles: FloatArray, together: int) -> tuple[FloatArray, FloatArray]:
-    """Return the lines that means of so many samples of all `cycles` show (`GridCycles.lines`)."""
-    count, points, channels = cycles.shape
-    flat = cycles.reshape(count * points // together, together, channels).mean(axis=1)
+def _standing_out(flat: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the lines of samples (sample, channel) of `count` cycles (`GridCycles.lines`)."""
     window = np.sin(pi * (np.arange(len(flat)) + 0.5) / len(flat)) ** 2
-    spectrum = rfft((flat - flat.mean(axis=0)) * window[:, None], axis=0)
+    spectrum = rfft(flat * window[:, None], axis=0)
     power = np.abs(spectrum[:int(BAND * len(flat))]) ** 2
     blocks = np.array_split(power, max(len(power) // _BLOCK, 1))
     floor = np.concatenate([np.broadcast_to(np.median(block, axis=0), block.shape)
