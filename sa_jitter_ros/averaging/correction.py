@@ -256,12 +256,13 @@ class _Aligned:
     """
     The `average` between the pulses that a `recovery` expects, `refitted` of them displaced.
 
-    It has the orders of `candidates` for lines of other shafts, too, behind its own ones.
+    It has the orders of `candidates` for lines of other shafts, too, behind its own ones: the
+    first ones, and others that count where none of the first does.
     """
 
     recovery: PulseErrorRecovery
     refitted: int
-    candidates: FloatArray
+    candidates: tuple[FloatArray, FloatArray]
     average: Average
 
 
@@ -272,7 +273,9 @@ def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings
     Recover the pulse errors and average again without them.
 
     They are recovered from orders and lines of other shafts that are `known`; else these are
-    looked for. A correction that is not accepted is returned as it is.
+    looked for. Strong ones, which leave images of themselves in recovered errors, stand out
+    between the measured pulses, weak ones between the recovered pulses. A correction that is not
+    accepted is returned as it is.
     """
     orders = () if known is None else np.unique(np.concatenate((raw.orders, *known))).tolist()
     recovery, refitted = _refitted(raw, cycles, settings, grids, orders)
@@ -282,11 +285,14 @@ def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings
         'cycle: check the pulses')
     if reason:
         return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
-    candidates = known[1] if known else other_lines(
-        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1],
-        recovery.expected / np.mean(raw.periods), raw.orders, settings.cycle_length)
-    return _Aligned(recovery, refitted, candidates, _average_again(
-        raw, cycles, _beside(settings, candidates), raw.pulses - recovery.expected))
+    grid = grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1]
+    errors = recovery.expected / np.mean(raw.periods)
+    first = known[1] if known else other_lines(
+        grid, 0.0 * errors, raw.orders, settings.cycle_length)
+    more = first[:0] if known else other_lines(
+        grid, errors, np.append(raw.orders, first), settings.cycle_length)
+    return _Aligned(recovery, refitted, (first, more), _average_again(
+        raw, cycles, _beside(settings, np.append(first, more)), raw.pulses - recovery.expected))
 
 
 def _beside(settings: AverageSettings, lines: FloatArray) -> AverageSettings:
@@ -305,12 +311,15 @@ def _of_orders(average: Average, settings: AverageSettings) -> Average:
 
 def _coherent(found: _Aligned, settings: AverageSettings) -> FloatArray:
     """Return the lines among the candidates that an average without pulse errors still shows."""
-    average, candidates = found.average, found.candidates
-    if not candidates.size:
-        return candidates
-    clean = _resampled(average, average.cycle_amplitudes, _beside(settings, candidates))[1]
-    lines = coherent(candidates, clean[..., len(settings.orders):], average.cycle_numbers,
-                     settings.cycle_length)
+    average, first = found.average, len(settings.orders)
+    clean = _resampled(average, average.cycle_amplitudes, _beside(
+        settings, np.concatenate(found.candidates)))[1]
+    lines = np.empty(0)
+    for candidates in found.candidates:
+        if candidates.size and not lines.size:
+            lines = coherent(candidates, clean[..., first:first + candidates.size],
+                             average.cycle_numbers, settings.cycle_length)
+        first += candidates.size
     while lines.size and not leaks_apart(
             _beside(settings, lines).orders, settings.cycle_length, len(clean)):
         lines = lines[:-1]

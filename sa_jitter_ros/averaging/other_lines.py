@@ -52,8 +52,9 @@ def other_lines(grid: GridCycles, errors: FloatArray, orders: FloatArray, cycle_
     """
     if len(grid.cycles) < _LEAST_CYCLES or not orders.size:
         return np.empty(0)
-    lines, power = grid.lines(_HIGHEST * float(orders.max()) * cycle_length, errors)
-    lines, span = lines / cycle_length, grid.span * cycle_length
+    span = grid.span * cycle_length
+    lines, power = grid.lines(_HIGHEST * float(orders.max()) * cycle_length, errors, span)
+    lines = lines / cycle_length
     whole = np.rint(lines)  # an order of the shaft that is not asked for is known exactly
     lines = np.where(np.abs(lines - whole) * span < _WHOLE, whole, lines)
     own = np.concatenate((orders, -orders))

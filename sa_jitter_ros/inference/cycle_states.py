@@ -24,11 +24,11 @@ estimated with them (expectation-maximisation).
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.bordered import Solved
@@ -458,9 +458,3 @@ def _products(parts: Array) -> tuple[ComplexArray, ComplexArray]:
     """Return products of waves, and those with the conjugate, of cosines and sines in turn."""
     cos, sin = parts[::2].view(np.complex128), parts[1::2].view(np.complex128)
     return cos + 1j * sin, (cos - 1j * sin).conj()
-
-
-@lru_cache(maxsize=4)
-def hann(count: int) -> Array:
-    """Return the periodic Hann window (count,)."""
-    return np.hanning(count + 1)[:-1]
