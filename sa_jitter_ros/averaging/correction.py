@@ -511,21 +511,17 @@ def _average_again(raw: Average, cycles: Sequence[CycleSamples],
     """Return the average of the same cycles between corrected pulses."""
     again = replace(settings, samples_per_revolution=raw.waveform.shape[1],
                     trigger_cycles=raw.trigger_cycles, maximum_discarded=1.0)
-    begins = np.flatnonzero(raw.used)
     first = round(raw.first_angle / settings.cycle_length)
-    shaft, average, run = ShaftAverager(again, first_cycle=first), None, 0
-    index = 0
-    while index < len(cycles):
-        if index and begins[index] != begins[index - 1] + 1:
-            shaft.skip(int(raw.cycle_numbers[index] - raw.cycle_numbers[index - 1]) - 1)
-            run = begins[index]
-        stop = run + int(np.argmin(raw.used[run:])) + 1
+    shaft, average = ShaftAverager(again, first_cycle=first), None
+    parts, numbers, index = _between(raw, cycles, pulses), raw.cycle_numbers, 0
+    while index < len(parts):
+        if index and parts[index].first == 0:
+            shaft.skip(int(numbers[index] - numbers[index - 1]) - 1)
         end = index + 1  # of the cycles that were cut out together: they are resampled together
-        while end < len(cycles) and cycles[end].samples is cycles[index].samples and (
-                begins[end] < stop - 1):
+        while end < len(parts) and parts[end].samples is parts[index].samples and (
+                parts[end].first > 0):
             end += 1
-        average = shaft.update(replace(cycles[index], pulses=pulses[run:stop],
-                                       first=int(begins[index] - run), count=end - index))
+        average = shaft.update(replace(parts[index], count=end - index))
         index = end
     assert average is not None
     return replace(average, sequence=raw.sequence)

@@ -144,15 +144,11 @@ class LineSearch:
         Orders are weighted by their square, as in the fit of the errors. True pulse errors can
         only give a value above 1; without orders it is 1.
         """
-        before, after = (self.power(item, orders, tapered=False)
+        before, after = (np.abs(self._lines(item, orders, tapered=False)) ** 2
                          for item in (0.0 * errors, errors))
         weight = orders[:, None] ** 2 / np.maximum(np.sum(before, axis=0), np.finfo(float).tiny)
         known = float(np.sum(weight * before))
         return float(np.sum(weight * after)) / known if known else 1.0
-
-    def power(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> FloatArray:
-        """Return an array (order, channel), the power of orders `g` without `errors` (pulse,)."""
-        return np.asarray(np.abs(self._lines(errors, g, tapered=tapered)) ** 2)
 
     def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
         channels = self.spectra.shape[2]
