@@ -26,7 +26,7 @@ from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.noise import attenuation, leaks_apart, without_leakage
-from sa_jitter_ros.averaging.other_lines import coherent, other_lines
+from sa_jitter_ros.averaging.other_lines import coherent, other_lines, with_images
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
@@ -226,6 +226,7 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
         return found
     lines = _coherent(found, settings)
     if lines.size:
+        lines = with_images(lines, raw.orders, settings.cycle_length, raw.fundamental_cycles)
         again = _aligned(raw, cycles, settings, grids, known=(found.recovery.orders, lines))
         found, lines = (found, lines[:0]) if isinstance(again, Correction) else (
             again, _coherent(again, settings))

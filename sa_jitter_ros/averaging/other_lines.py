@@ -63,13 +63,29 @@ def other_lines(grid: GridCycles, errors: FloatArray, orders: FloatArray, cycle_
     by_leakage = np.argsort(-power * share)
     mirrored = np.abs(2.0 * orders[:, None, None] - lines[:, None] - lines) * span < 1.0
     alone = ~np.any(mirrored & (power > _MIRRORED * power[:, None]), axis=(0, 2))
+    return _apart(lines[by_leakage][alone[by_leakage]], own, span)
+
+
+def _apart(lines: FloatArray, others: FloatArray, span: float) -> FloatArray:
+    """Return the first 16 lines that are apart from all before them and from others."""
     found = np.empty(0)
-    for line in lines[by_leakage][alone[by_leakage]]:
-        if np.all(np.abs(line - np.append(own, found)) * span >= _LEAST_TURNS):
+    for line in lines:
+        if found.size < _MOST and np.all(
+                np.abs(line - np.append(others, found)) * span >= _LEAST_TURNS):
             found = np.append(found, line)
-        if found.size == _MOST:
-            break
     return found
+
+
+def with_images(lines: FloatArray, orders: FloatArray, cycle_length: float, span: float
+                ) -> FloatArray:
+    """
+    Return lines, and images of those that are up to half a turn of a cycle beside an order.
+
+    An order whose length changes has both. `span` are the turns of the shaft in all cycles.
+    """
+    near = orders[np.argmin(np.abs(lines[:, None] - orders), axis=1)]
+    images = (2.0 * near - lines)[np.abs(lines - near) * cycle_length <= 0.5]
+    return np.append(lines, _apart(images, np.concatenate((orders, -orders, lines)), span))
 
 
 def coherent(lines: FloatArray, cycles: ComplexArray, numbers: NDArray[np.int64],
