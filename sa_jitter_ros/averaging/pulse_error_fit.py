@@ -142,7 +142,6 @@ class CompressedCycles:
             out[:, :, :len(mixing), half + column] = -mixed.imag
         return Response(*out)
 
-
     def fitted(self, errors: FloatArray, chosen: Sequence[int] | NDArray[np.intp], *,
                covariance: FloatArray | None = None
                ) -> tuple[Response, ComplexArray, FloatArray]:
