@@ -65,8 +65,53 @@ def test_amplitudes_beside_another_shaft_are_as_good_as_alone(cycles, ratio):
         assert abs(np.mean(z < width) - share) < 3.0 * np.sqrt(share * (1.0 - share) / z.size)
 
 
-def grid_of(samples, cycles):
-    return GridCycles(samples[:-1].reshape(cycles, -1, 1))
+def z_scores(rng, width, beside, size, *, noise, missing):
+    """
+    Return the recovered errors of 40 cycles less the true ones, in standard errors.
+
+    These are uniform on `width` cycles of order 19; the line at order `beside` is of another
+    shaft.
+    """
+    points, period = 512, 0.05
+    time = np.arange(54 * points) * period / points
+    true = period * (2.0 + np.arange(50.0))
+    late = true + width / 19.0 * period * rng.uniform(-0.5, 0.5, true.size)
+    phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+    samples = np.cos(2.0 * np.pi * np.outer(time / period, [19.0, 38.0, beside]) + phase
+                     ) @ [1.0, 0.5, size] + noise * rng.standard_normal(time.size)
+    kept = np.setdiff1d(np.arange(true.size), missing)
+    average, *_ = sa.average(
+        samples, points / period, late[kept], orders=[19.0, 38.0], trigger_cycles=40,
+        correct_jitter=True, maximum_discarded=0.2, keyphasor_rate=19.0 / (width * period))
+    assert average.correction.accepted
+    assert (average.discarded_cycles > 0) == bool(missing)
+    errors = (late - true)[np.searchsorted(late, average.pulses)]
+    return (average.correction.pulse_errors - errors + errors.mean()
+            ) / average.correction.standard_errors
+
+
+@pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+@pytest.mark.parametrize('missing', [(), (20, 33)])
+@pytest.mark.parametrize('seed', range(12))
+def test_a_line_beside_an_order_does_not_pass_for_errors(seed, missing):
+    rng = np.random.default_rng([seed, 5])
+    beside = 38.0 + rng.choice([-1.0, 1.0]) * rng.uniform(3.0, 19.0) / 40.0
+    size = 10.0 ** (rng.uniform(-6.0, 6.0) / 20.0)  # half to twice the strongest order
+    found = z_scores(rng, rng.uniform(0.05, 0.2), beside, size, noise=0.3, missing=missing)
+    # a mean square of 41 normal variables
+    assert np.mean(found**2) < 1.0 + 4.0 * np.sqrt(2.0 / found.size)
+
+
+@pytest.mark.parametrize('share', [0.007, 0.07])
+def test_a_weak_line_beside_an_order_does_not_disturb(rng, share):
+    found = z_scores(rng, 0.1, 38.3, 0.5 * share, noise=0.01, missing=())
+    assert np.mean(found**2) < 1.0 + 4.0 * np.sqrt(2.0 / found.size)
+
+
+def lines_of(samples, cycles, ratio=1.0, *, orders=ORDERS, errors=None):
+    """Return the lines of cycles at even angles, or between pulses with errors (pulse,)."""
+    grid = GridCycles(samples[:-1].reshape(cycles, -1, 1))
+    return other_lines(grid, np.zeros(cycles + 1) if errors is None else errors, orders, ratio)
 
 
 @pytest.mark.parametrize('ratio', [1.0, 0.3137, 2.40789])
@@ -74,38 +119,42 @@ def test_lines_are_found_at_their_orders(ratio, rng):
     cycles, others = 40, np.array([6.52, 13.04, 19.56])
     theta = ratio * np.linspace(0.0, cycles, cycles * POINTS * 3 + 1)
     samples = wave(theta, np.append(ORDERS, others), np.append(SIZE, [0.3, 0.4, 0.5]), rng)
-    found = other_lines(grid_of(samples, cycles), ORDERS, ratio)
+    found = lines_of(samples, cycles, ratio)
     near = found[np.argmin(np.abs(found[:, None] - others), axis=0)]
     assert np.abs(near - others).max() < 0.1 / (cycles * ratio)
     rough = others + 0.3 / (cycles * ratio)
     amplitudes = project(samples[:, None], ratio, tuple(rough), count=cycles)
-    exact = coherent(rough, amplitudes, ratio)
+    exact = coherent(rough, amplitudes, np.arange(cycles), ratio)
     assert np.abs(exact - others).max() < 0.03 / (cycles * ratio)
 
 
-def test_what_pulse_errors_make_is_no_line():
-    """They make lines on both sides of an order, which are gone without the errors."""
-    cycles, found, left = 40, 0, 0
-    theta = np.linspace(0.0, cycles, cycles * POINTS * 3 + 1)
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        late = np.interp(theta, np.arange(cycles + 1.0), rng.normal(0.0, 0.003, cycles + 1))
-        grid = grid_of(wave(theta + late, ORDERS, SIZE, rng), cycles)
-        candidates = other_lines(grid, ORDERS, 1.0)
-        clean = project(wave(theta, ORDERS, SIZE, rng)[:, None], 1.0, tuple(candidates),
-                        count=cycles)
-        found += candidates.size
-        left += coherent(candidates, clean, 1.0).size if candidates.size else 0
-    assert found < 60  # of 160: the others have an image as strong
-    assert not left
+def test_what_pulse_errors_make_is_no_line(rng):
+    """They hide weak lines, which stand out without the errors."""
+    errors = rng.normal(0.0, 0.003, 41)
+    theta = np.linspace(0.0, 40.0, 40 * POINTS * 3 + 1)
+    late = theta + np.interp(theta, np.arange(41.0), errors)
+    assert not lines_of(wave(late, ORDERS, SIZE, rng), 40, errors=errors).size
+    beside = wave(late, np.append(ORDERS, 16.6), np.append(SIZE, 0.02), rng)
+    assert not lines_of(beside, 40).size
+    assert lines_of(beside, 40, errors=errors) == pytest.approx([16.6], abs=0.01)
+
+
+def test_a_line_keeps_its_amplitude_over_a_gap(rng):
+    numbers = np.delete(np.arange(40), [7, 22, 23])
+    steady = np.exp(2j * np.pi * (0.004 * numbers[:, None, None] + rng.uniform(size=(1, 2, 1))))
+    noise = 0.3 * rng.standard_normal((37, 2, 1))
+    assert coherent(np.array([6.5]), steady + noise, numbers, 1.0) == pytest.approx(
+        [6.504], abs=2e-3)
+    turned = steady * np.exp(2j * np.pi * rng.uniform(size=(37, 1, 1)))
+    assert not coherent(np.array([6.5]), turned + noise, numbers, 1.0).size
 
 
 def test_few_cycles_and_slow_changes_show_no_lines(rng):
     theta = np.linspace(0.0, 40.0, 40 * POINTS + 1)
     slow = wave(theta, ORDERS, SIZE, rng) * (1.0 + 0.2 * np.cos(np.pi * theta / 40.0))
-    assert not other_lines(grid_of(slow, 40), ORDERS, 1.0).size
+    assert not lines_of(slow, 40).size
     beside = wave(theta, np.append(ORDERS, 6.5), np.append(SIZE, 0.5), rng)
-    assert other_lines(grid_of(beside, 40), ORDERS, 1.0).size
+    assert lines_of(beside, 40).size
     few = beside[:7 * POINTS + 1]
-    assert not other_lines(grid_of(few, 7), ORDERS, 1.0).size
-    assert not other_lines(grid_of(beside, 40), np.empty(0), 1.0).size
+    assert not lines_of(few, 7).size
+    assert not lines_of(beside, 40, orders=np.empty(0)).size

@@ -311,28 +311,6 @@ def test_a_known_order_of_another_shaft_helps_and_does_not_disturb(rng):
     assert np.mean(z_scores(recovery, errors) ** 2) < 1.0 + 4.0 * np.sqrt(2.0 / errors.size)
 
 
-@pytest.mark.parametrize('seed', range(12))
-def test_an_unknown_order_of_another_shaft_beside_an_order_does_not_pass_for_errors(seed):
-    rng = np.random.default_rng([seed, 5])
-    width, count = rng.uniform(0.05, 0.2), 40
-    errors = jitter(rng, width, count=count, speed=1.0 / PERIOD)
-    beside = 38.0 + rng.choice([-1.0, 1.0]) * rng.uniform(3.0, 19.0) / count
-    size = 10.0 ** (rng.uniform(-6.0, 6.0) / 20.0)  # half to twice the strongest order
-    cycles, pulses = simulate(rng, errors, {**MESH, beside: [size]}, ratio=1.0, noise=0.3)
-    recovery = recover(cycles, pulses, declared=declared(width, 1.0 / PERIOD), ratio=1.0)
-    assert recovery.accepted
-    # a mean square of 41 normal variables
-    assert np.mean(z_scores(recovery, errors) ** 2) < 1.0 + 4.0 * np.sqrt(2.0 / errors.size)
-
-
-@pytest.mark.parametrize(('share', 'fitted'), [(0.007, False), (0.07, True)])
-def test_an_order_of_another_shaft_is_fitted_where_it_matters(rng, share, fitted):
-    errors = jitter(rng, 0.1, count=40, speed=1.0 / PERIOD)
-    cycles, pulses = simulate(rng, errors, {**MESH, 38.3: [0.5 * share]}, ratio=1.0, noise=0.01)
-    recovery = recover(cycles, pulses, declared=declared(0.1, 1.0 / PERIOD), ratio=1.0)
-    assert bool(np.any(np.abs(recovery.orders - 38.3) < 0.01)) == fitted
-
-
 @pytest.mark.parametrize('count', [2, 3, 4, 5])
 def test_few_cycles_work_or_are_refused(rng, count):
     for width in (0.02, 0.4):

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import long_run_variance
-from sa_jitter_ros.averaging.pulse_error_fit import (
-    least_squares, PulseErrorFit, PulseErrorProblem, real_parts)
+from sa_jitter_ros.averaging.pulse_error_fit import (PulseErrorFit, PulseErrorProblem,
+                                                     real_parts)
 
 FloatArray = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Alignment:
 def alignment(problem: PulseErrorProblem, fit: PulseErrorFit) -> Alignment:
     """Return what the noise beside the lines of a `fit` of a `problem` makes of amplitudes."""
     turned, pull, unit = _in_phase(problem, fit)
-    late, begins = fit.precision.solve(pull), problem.model.begins
+    late, begins = fit.precision.solve(pull), problem.model.grid.begins
     late -= late.mean()
     begin, end = late[begins], late[begins + 1]
     power = np.maximum(np.abs(fit.amplitudes) ** 2 * unit[:, None], _TINY)
@@ -87,17 +87,15 @@ def _in_phase(problem: PulseErrorProblem, fit: PulseErrorFit
     pulse does, their weighted sums (pulse,), and the power (order,) of unit orders.
     """
     model, half = problem.model, len(fit.orders)
-    response = model.response(fit.expected, problem.chosen)
-    residual = model.coefficients - response.signal @ real_parts(
-        least_squares(response.signal, model.coefficients))
+    response, _, residual = model.fitted(fit.expected, problem.chosen)
     size = 2.0 * np.pi * fit.orders[:, None] * fit.amplitudes * problem.significant
     slope, weighted = real_parts(size), residual * fit.weight**2
-    pull = np.zeros(model.pulses)
+    pull = np.zeros(model.grid.pulses)
     turned = []
     for number, unit_orders in enumerate((response.signal - response.late, response.late)):
         both = np.matmul(unit_orders.transpose(0, 2, 1), residual) * slope
         turned.append(both[:, :half] + both[:, half:])
-        pull[model.begins + number] += np.einsum(
+        pull[model.grid.begins + number] += np.einsum(
             'kdc,kdc->k', unit_orders @ slope, weighted)
     unit = np.mean(np.sum(response.signal[:, :, :half] ** 2, axis=1), axis=0)
     return np.array(turned), pull, unit

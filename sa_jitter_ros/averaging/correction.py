@@ -26,7 +26,7 @@ from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.noise import attenuation, leaks_apart, without_leakage
-from sa_jitter_ros.averaging.other_lines import coherent, other_lines
+from sa_jitter_ros.averaging.other_lines import coherent, other_lines, with_images
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
@@ -226,8 +226,10 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
         return found
     lines = _coherent(found, settings)
     if lines.size:
-        again = _aligned(raw, cycles, _beside(settings, lines), grids, search=False)
-        found, lines = (found, lines[:0]) if isinstance(again, Correction) else (again, lines)
+        lines = with_images(lines, raw.orders, settings.cycle_length, raw.fundamental_cycles)
+        again = _aligned(raw, cycles, settings, grids, known=(found.recovery.orders, lines))
+        found, lines = (found, lines[:0]) if isinstance(again, Correction) else (
+            again, _coherent(again, settings))
     recovery, periods = found.recovery, raw.periods
     aligned, scatter = _steady(found.average, settings, lines)
     corrected = _of_orders(found.average, settings)
@@ -255,34 +257,43 @@ class _Aligned:
     """
     The `average` between the pulses that a `recovery` expects, `refitted` of them displaced.
 
-    It has the orders of `candidates` for lines of other shafts, too, behind its own ones.
+    It has the orders of `candidates` for lines of other shafts, too, behind its own ones: the
+    first ones, and others that count where none of the first does.
     """
 
     recovery: PulseErrorRecovery
     refitted: int
-    candidates: FloatArray
+    candidates: tuple[FloatArray, FloatArray]
     average: Average
 
 
 def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-             grids: LatestGrid, *, search: bool = True) -> _Aligned | Correction:
+             grids: LatestGrid, *,
+             known: tuple[FloatArray, FloatArray] | None = None) -> _Aligned | Correction:
     """
-    Recover the pulse errors and average again without them; `search` lines of other shafts.
+    Recover the pulse errors and average again without them.
 
-    A correction that is not accepted is returned as it is.
+    They are recovered from orders and lines of other shafts that are `known`; else these are
+    looked for. Strong ones, which leave images of themselves in recovered errors, stand out
+    between the measured pulses, weak ones between the recovered pulses. A correction that is not
+    accepted is returned as it is.
     """
-    recovery, refitted = _refitted(raw, cycles, settings, grids)
+    orders = () if known is None else np.unique(np.concatenate((raw.orders, *known))).tolist()
+    recovery, refitted = _refitted(raw, cycles, settings, grids, orders)
     largest, reach = np.abs(recovery.expected).max(), _REACH * raw.periods.min()
     reason = recovery.reason if largest <= reach else (
         f'a pulse error of {largest:.3g} s is above {reach:.3g} s, {_REACH:.0%} of a trigger '
         'cycle: check the pulses')
     if reason:
         return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
-    candidates = other_lines(
-        grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1], raw.orders,
-        settings.cycle_length) if search and not raw.discarded_cycles else np.empty(0)
-    return _Aligned(recovery, refitted, candidates, _average_again(
-        raw, cycles, _beside(settings, candidates), raw.pulses - recovery.expected))
+    grid = grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1]
+    errors = recovery.expected / np.mean(raw.periods)
+    first = known[1] if known else other_lines(
+        grid, 0.0 * errors, raw.orders, settings.cycle_length)
+    more = first[:0] if known else other_lines(
+        grid, errors, np.append(raw.orders, first), settings.cycle_length)
+    return _Aligned(recovery, refitted, (first, more), _average_again(
+        raw, cycles, _beside(settings, np.append(first, more)), raw.pulses - recovery.expected))
 
 
 def _beside(settings: AverageSettings, lines: FloatArray) -> AverageSettings:
@@ -301,11 +312,15 @@ def _of_orders(average: Average, settings: AverageSettings) -> Average:
 
 def _coherent(found: _Aligned, settings: AverageSettings) -> FloatArray:
     """Return the lines among the candidates that an average without pulse errors still shows."""
-    average, candidates = found.average, found.candidates
-    if not candidates.size:
-        return candidates
-    clean = _resampled(average, average.cycle_amplitudes, _beside(settings, candidates))[1]
-    lines = coherent(candidates, clean[..., len(settings.orders):], settings.cycle_length)
+    average, first = found.average, len(settings.orders)
+    clean = _resampled(average, average.cycle_amplitudes, _beside(
+        settings, np.concatenate(found.candidates)))[1]
+    lines = np.empty(0)
+    for candidates in found.candidates:
+        if candidates.size and not lines.size:
+            lines = coherent(candidates, clean[..., first:first + candidates.size],
+                             average.cycle_numbers, settings.cycle_length)
+        first += candidates.size
     while lines.size and not leaks_apart(
             _beside(settings, lines).orders, settings.cycle_length, len(clean)):
         lines = lines[:-1]
@@ -400,13 +415,13 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
 
 
 def _refitted(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-              grids: LatestGrid) -> tuple[PulseErrorRecovery, int]:
+              grids: LatestGrid, orders: Sequence[float]) -> tuple[PulseErrorRecovery, int]:
     """
     Recover the pulse errors, where needed again without the pulses that no jitter explains.
 
     The second result is the number of these.
     """
-    recovery, grid = _recovered(raw, cycles, settings, grids)
+    recovery, grid = _recovered(raw, cycles, settings, grids, orders)
     begins = np.flatnonzero(raw.used)
     moved = np.zeros(raw.pulses.size)
     for _ in range(_ROUNDS):
@@ -423,7 +438,7 @@ def _refitted(raw: Average, cycles: list[CycleSamples], settings: AverageSetting
             return recovery, 0
         again = replace(raw, pulses=raw.pulses - moved)
         recovery, grid = _recovered(
-            again, _between(raw, cycles, again.pulses), settings, grids)
+            again, _between(raw, cycles, again.pulses), settings, grids, orders)
     if not moved.any():
         return recovery, 0
     shift = moved - moved.mean()
@@ -437,13 +452,14 @@ def _declared(cycles: Sequence[CycleSamples], settings: AverageSettings) -> floa
 
 
 def _recovered(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
-               grids: LatestGrid) -> tuple[PulseErrorRecovery, FloatArray]:
+               grids: LatestGrid, orders: Sequence[float]
+               ) -> tuple[PulseErrorRecovery, FloatArray]:
     """Recover the errors of the pulses of `raw` from its trigger `cycles`; return both."""
     # The recovery is a model of the linear law, whatever law the settings have.
     grid, seen, informative = grids.of(cycles, settings.interpolation, raw.cycle_numbers)
     found = recover_pulse_errors(
         seen, periods=raw.periods, cycle_length=settings.cycle_length,
-        first_angle=raw.first_angle, additional_orders=settings.orders,
+        first_angle=raw.first_angle, orders=orders, additional_orders=settings.orders,
         declared_standard_deviation=_declared(cycles, settings))
     return _of_all_channels(found, informative), grid
 
@@ -496,21 +512,17 @@ def _average_again(raw: Average, cycles: Sequence[CycleSamples],
     """Return the average of the same cycles between corrected pulses."""
     again = replace(settings, samples_per_revolution=raw.waveform.shape[1],
                     trigger_cycles=raw.trigger_cycles, maximum_discarded=1.0)
-    begins = np.flatnonzero(raw.used)
     first = round(raw.first_angle / settings.cycle_length)
-    shaft, average, run = ShaftAverager(again, first_cycle=first), None, 0
-    index = 0
-    while index < len(cycles):
-        if index and begins[index] != begins[index - 1] + 1:
-            shaft.skip(int(raw.cycle_numbers[index] - raw.cycle_numbers[index - 1]) - 1)
-            run = begins[index]
-        stop = run + int(np.argmin(raw.used[run:])) + 1
+    shaft, average = ShaftAverager(again, first_cycle=first), None
+    parts, numbers, index = _between(raw, cycles, pulses), raw.cycle_numbers, 0
+    while index < len(parts):
+        if index and parts[index].first == 0:
+            shaft.skip(int(numbers[index] - numbers[index - 1]) - 1)
         end = index + 1  # of the cycles that were cut out together: they are resampled together
-        while end < len(cycles) and cycles[end].samples is cycles[index].samples and (
-                begins[end] < stop - 1):
+        while end < len(parts) and parts[end].samples is parts[index].samples and (
+                parts[end].first > 0):
             end += 1
-        average = shaft.update(replace(cycles[index], pulses=pulses[run:stop],
-                                       first=int(begins[index] - run), count=end - index))
+        average = shaft.update(replace(parts[index], count=end - index))
         index = end
     assert average is not None
     return replace(average, sequence=raw.sequence)

@@ -21,6 +21,8 @@ from math import pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.spectral_lines import line_limit, peaks, spectrum
+from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import rfft
 
 FloatArray = NDArray[np.float64]
@@ -30,9 +32,6 @@ ComplexArray = NDArray[np.complex128]
 _SEARCHED_CYCLES = 32
 # The part of the sampling rate in which lines and orders are searched.
 BAND = 0.4
-# Lines of the spectrum of all cycles whose median is the noise of each, how far a line is above it
-# that noise alone makes in one of a million, and most lines.
-_BLOCK, _STANDS_OUT, _MOST_LINES = 64, 20.0, 256
 # A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
 # of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
 # Lengths of panels are this factor apart, so that fits up to similar orders share them.
@@ -55,12 +54,17 @@ class GridCycles:
         self.begins = np.arange(len(self.cycles))
         self.begins[1:] += np.cumsum(np.diff(self.numbers) > 1)
         self._compact: dict[int, FloatArray] = {}
-        self._lines: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._means: dict[int, FloatArray] = {}
 
     @property
     def pulses(self) -> int:
         """Return the number of pulses between which the cycles lie."""
         return int(self.begins[-1]) + 2
+
+    @property
+    def span(self) -> int:
+        """Return the number of cycles with those at gaps."""
+        return int(self.numbers[-1]) + 1
 
     @cached_property
     def samples(self) -> FloatArray:
@@ -91,19 +95,32 @@ class GridCycles:
             spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
         return spectra
 
-    def lines(self, top: float) -> tuple[FloatArray, FloatArray]:
+    def lines(self, top: float, errors: FloatArray, turns: float) -> tuple[FloatArray, FloatArray]:
         """
         Return the lines up to `top`, or more, that stand out in the spectrum of all cycles.
 
-        They are in cycles in a trigger cycle, below 0.4 of the sampling rate, with their power
-        (line,) over the noise around, of the channel in which they are clearest.
+        Pulse `errors` (pulse,), in trigger cycles, are removed from the angle, which has so many
+        `turns` of the shaft. Lines are in cycles in a trigger cycle, below 0.4 of the sampling
+        rate, with their power (line,) over the noise around.
         """
-        points = self.cycles.shape[1]
+        count, points, channels = self.cycles.shape
         most = 2 ** int(np.log2(max(BAND * points / top, 1.0)))  # the same for similar shafts
         together = max(number for number in range(1, most + 1) if points % number == 0)
-        if together not in self._lines:
-            self._lines[together] = _standing_out(self.cycles, together)
-        return self._lines[together]
+        if together not in self._means:
+            means = self.cycles.reshape(count, -1, together, channels).mean(axis=2)
+            whole = np.zeros((self.span, *means.shape[1:]))
+            whole[self.numbers] = means - means.mean(axis=(0, 1))
+            self._means[together] = whole.reshape(-1, channels)
+        flat = self._means[together]
+        ends = np.stack((self.begins, self.begins + 1), axis=1)
+        knots = self.numbers[:, None] + np.arange(2.0)
+        place = np.interp(np.arange(len(flat)) * (self.span / len(flat)),
+                          (knots + errors[ends]).ravel(), knots.ravel())
+        flat = interpolate(flat, np.minimum(place * (len(flat) / self.span), len(flat) - 1.0))
+        ratio, _ = spectrum(flat, turns, self.size)
+        ratio = ratio[:int(BAND * len(flat))]
+        bins, tops = peaks(ratio, line_limit(channels, len(ratio)))
+        return tops / self.span, ratio[bins]
 
     def compact(self, rows: FloatArray, cycles: float) -> tuple[FloatArray, FloatArray]:
         """
@@ -120,26 +137,6 @@ class GridCycles:
         if length not in self._compact:
             self._compact[length] = _in_panels(flat, length)
         return _in_panels(rows, length), self._compact[length]
-
-
-def _standing_out(cycles: FloatArray, together: int) -> tuple[FloatArray, FloatArray]:
-    """Return the lines that means of so many samples of all `cycles` show (`GridCycles.lines`)."""
-    count, points, channels = cycles.shape
-    flat = cycles.reshape(count * points // together, together, channels).mean(axis=1)
-    window = np.sin(pi * (np.arange(len(flat)) + 0.5) / len(flat)) ** 2
-    spectrum = rfft((flat - flat.mean(axis=0)) * window[:, None], axis=0)
-    power = np.abs(spectrum[:int(BAND * len(flat))]) ** 2
-    blocks = np.array_split(power, max(len(power) // _BLOCK, 1))
-    floor = np.concatenate([np.broadcast_to(np.median(block, axis=0), block.shape)
-                            for block in blocks])
-    power = np.max(power / np.maximum(floor, np.finfo(float).tiny), axis=1)
-    inside = power[1:-1]
-    place = 1 + np.flatnonzero((inside > power[:-2]) & (inside >= power[2:])
-                               & (inside > _STANDS_OUT))
-    place = place[np.argsort(-power[place])[:_MOST_LINES]]
-    before, here, after = (np.log(power[place + shift]) for shift in (-1, 0, 1))
-    off = 0.5 * (before - after) / (before - 2.0 * here + after)
-    return (place + off) / count, power[place]
 
 
 def cycle_weights(count: int) -> FloatArray:

@@ -42,17 +42,19 @@ _MIRRORED = 0.25
 _STEPS = 16  # places between two lines of the spectrum at which the order of a line is refined
 
 
-def other_lines(grid: GridCycles, orders: FloatArray, cycle_length: float) -> FloatArray:
+def other_lines(grid: GridCycles, errors: FloatArray, orders: FloatArray, cycle_length: float
+                ) -> FloatArray:
     """
-    Return the orders of lines that may leak into `orders`, of consecutive trigger cycles.
+    Return the orders of lines that may leak into `orders` of trigger cycles.
 
-    `cycle_length` is r. Those that may leak most come first, at most 16.
+    Pulse `errors` (pulse,), in trigger cycles, are removed from the angle; `cycle_length` is r.
+    Those that may leak most come first, at most 16.
     """
-    count = len(grid.cycles)
-    if count < _LEAST_CYCLES or not orders.size:
+    if len(grid.cycles) < _LEAST_CYCLES or not orders.size:
         return np.empty(0)
-    lines, power = grid.lines(_HIGHEST * float(orders.max()) * cycle_length)
-    lines, span = lines / cycle_length, count * cycle_length
+    span = grid.span * cycle_length
+    lines, power = grid.lines(_HIGHEST * float(orders.max()) * cycle_length, errors, span)
+    lines = lines / cycle_length
     whole = np.rint(lines)  # an order of the shaft that is not asked for is known exactly
     lines = np.where(np.abs(lines - whole) * span < _WHOLE, whole, lines)
     own = np.concatenate((orders, -orders))
@@ -61,27 +63,45 @@ def other_lines(grid: GridCycles, orders: FloatArray, cycle_length: float) -> Fl
     by_leakage = np.argsort(-power * share)
     mirrored = np.abs(2.0 * orders[:, None, None] - lines[:, None] - lines) * span < 1.0
     alone = ~np.any(mirrored & (power > _MIRRORED * power[:, None]), axis=(0, 2))
+    return _apart(lines[by_leakage][alone[by_leakage]], own, span)
+
+
+def _apart(lines: FloatArray, others: FloatArray, span: float) -> FloatArray:
+    """Return the first 16 lines that are apart from all before them and from others."""
     found = np.empty(0)
-    for line in lines[by_leakage][alone[by_leakage]]:
-        if np.all(np.abs(line - np.append(own, found)) * span >= _LEAST_TURNS):
+    for line in lines:
+        if found.size < _MOST and np.all(
+                np.abs(line - np.append(others, found)) * span >= _LEAST_TURNS):
             found = np.append(found, line)
-        if found.size == _MOST:
-            break
     return found
 
 
-def coherent(lines: FloatArray, cycles: ComplexArray, cycle_length: float) -> FloatArray:
+def with_images(lines: FloatArray, orders: FloatArray, cycle_length: float, span: float
+                ) -> FloatArray:
     """
-    Return the orders of those `lines` that pulse errors do not make, of consecutive cycles.
+    Return lines, and images of those that are up to half a turn of a cycle beside an order.
 
-    `cycles` (cycle, channel, line) are their amplitudes in trigger cycles without pulse errors. A
-    line keeps its amplitude from cycle to cycle, and turns by what its order is off.
+    An order whose length changes has both. `span` are the turns of the shaft in all cycles.
+    """
+    near = orders[np.argmin(np.abs(lines[:, None] - orders), axis=1)]
+    images = (2.0 * near - lines)[np.abs(lines - near) * cycle_length <= 0.5]
+    return np.append(lines, _apart(images, np.concatenate((orders, -orders, lines)), span))
+
+
+def coherent(lines: FloatArray, cycles: ComplexArray, numbers: NDArray[np.int64],
+             cycle_length: float) -> FloatArray:
+    """
+    Return the orders of those `lines` that pulse errors do not make.
+
+    `cycles` (cycle, channel, line) are their amplitudes in trigger cycles without pulse errors,
+    which are numbers `numbers` (cycle,) from 0 on. A line keeps its amplitude from cycle to cycle,
+    and turns by what its order is off.
     """
     count, channels, _ = cycles.shape
     known, off = lines == np.rint(lines), np.zeros(lines.size)
     for width in (1.0, 0.1):  # of the search, in lines of the spectrum of all cycles
-        step = width * np.arange(-_STEPS, _STEPS + 1) / (2.0 * _STEPS * count)
-        waves = np.exp(-2j * np.pi * (off + step[:, None]) * np.arange(count)[:, None, None])
+        step = width * np.arange(-_STEPS, _STEPS + 1) / (2.0 * _STEPS * (numbers[-1] + 1.0))
+        waves = np.exp(-2j * np.pi * (off + step[:, None]) * numbers[:, None, None])
         sums = np.abs(np.einsum('ksl,kcl->scl', waves, cycles)) ** 2 / count
         best = np.where(known, _STEPS, np.argmax(np.sum(sums, axis=1), axis=0))
         off = off + step[best]

@@ -101,8 +101,7 @@ class CompressedCycles:
     `coefficients` (cycle, dimension, channel); `blocks` (order,) is the first dimension that was
     added for an order. The real part of `mixing[i]` (dimension, node) times the complex values of
     order i at its `nodes[i]` are coefficients; `start` (cycle, order) are the angles of the orders
-    at the start of the cycles, in turns. `numbers` (cycle,) and `begins` (cycle,) are those of
-    `GridCycles`.
+    at the start of the cycles of `grid`, in turns.
     """
 
     coefficients: FloatArray
@@ -111,13 +110,7 @@ class CompressedCycles:
     nodes: tuple[FloatArray, ...]
     mixing: tuple[ComplexArray, ...]
     start: FloatArray
-    numbers: NDArray[np.int64]
-    begins: NDArray[np.int64]
-
-    @property
-    def pulses(self) -> int:
-        """Return the number of pulses between which the cycles lie."""
-        return int(self.begins[-1]) + 2
+    grid: GridCycles
 
     @property
     def sizes(self) -> NDArray[np.intp]:
@@ -133,7 +126,8 @@ class CompressedCycles:
         are known.
         """
         count, size, _ = self.coefficients.shape
-        half, first, last = len(chosen), errors[self.begins], errors[self.begins + 1]
+        half, begins = len(chosen), self.grid.begins
+        first, last = errors[begins], errors[begins + 1]
         out = np.zeros((3, count, size, 2 * half))
         for column, i in enumerate(chosen):
             u, mixing = self.nodes[i], self.mixing[i]
@@ -141,12 +135,24 @@ class CompressedCycles:
                 np.outer(first, 1.0 - u) + np.outer(last, u))
             values = np.exp(2j * pi * turns)
             left = 1.0 if covariance is None else np.exp(
-                -2.0 * (pi * self.orders[i]) ** 2 * variance_within(covariance, u, self.begins))
+                -2.0 * (pi * self.orders[i]) ** 2 * variance_within(covariance, u, begins))
             weighted = np.stack((values, values * u, values * left))
             mixed = (weighted.reshape(-1, len(u)) @ mixing.T).reshape(3, count, len(mixing))
             out[:, :, :len(mixing), column] = mixed.real
             out[:, :, :len(mixing), half + column] = -mixed.imag
         return Response(*out)
+
+    def fitted(self, errors: FloatArray, chosen: Sequence[int] | NDArray[np.intp], *,
+               covariance: FloatArray | None = None
+               ) -> tuple[Response, ComplexArray, FloatArray]:
+        """
+        Return the `response` of `chosen` orders, fitted: it, amplitudes, and what is left.
+
+        The amplitudes (order, channel) are the likeliest ones, the rest is one of coefficients.
+        """
+        response = self.response(errors, chosen, covariance=covariance)
+        amplitudes = least_squares(response.signal, response.expected, self.coefficients)
+        return response, amplitudes, self.coefficients - response.signal @ real_parts(amplitudes)
 
 
 def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, orders: FloatArray,
@@ -176,8 +182,7 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
     coefficients = inside.reshape(-1, count, channels)
     start = np.multiply.outer(first_angle + cycle_length * grid.numbers, orders) % 1.0
     return CompressedCycles(np.ascontiguousarray(coefficients.transpose(1, 0, 2)), orders,
-                            ends - 2 * widths, tuple(nodes), mixing, start, grid.numbers,
-                            grid.begins)
+                            ends - 2 * widths, tuple(nodes), mixing, start, grid)
 
 
 def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -203,27 +208,19 @@ def variance_within(covariance: FloatArray, u: FloatArray, begins: NDArray[np.in
     return np.asarray((1.0 - u) ** 2 * first + 2.0 * u * (1.0 - u) * both + u**2 * last)
 
 
-def least_squares(signal: FloatArray, coefficients: FloatArray,
-                  expected: FloatArray | None = None) -> ComplexArray:
+def least_squares(signal: FloatArray, expected: FloatArray, coefficients: FloatArray
+                  ) -> ComplexArray:
     """
     Return the amplitudes (order, channel) that fit all cycles best (`Response.signal`).
 
-    With uncertain errors `expected` is what they leave of it (`Response.expected`). It enters the
-    correlation with the cycles only: an error turns a phasor, whose power stays.
+    What uncertain errors leave of it, `expected`, enters the correlation with the cycles only: an
+    error turns a phasor, whose power stays.
     """
     f = signal.reshape(-1, signal.shape[2])
-    e = f if expected is None else expected.reshape(f.shape)
+    e = expected.reshape(f.shape)
     parts = np.linalg.lstsq(f.T @ f, e.T @ coefficients.reshape(len(f), -1), rcond=None)[0]
     half = len(parts) // 2
     return np.asarray(parts[:half] + 1j * parts[half:])
-
-
-def deviations(signal: FloatArray, residual: FloatArray) -> ComplexArray:
-    """Return the deviation of amplitudes (cycle, order, channel) that a residual means."""
-    parts = np.matmul(signal.transpose(0, 2, 1), residual)
-    parts /= np.sum(signal * signal, axis=1)[:, :, None]
-    half = signal.shape[2] // 2
-    return np.asarray(parts[:, :half] + 1j * parts[:, half:])
 
 
 @dataclass(frozen=True)
@@ -281,29 +278,27 @@ class PulseErrorProblem:
         standard deviation of the errors; their size is estimated with them (`estimated_size`).
         """
         model, orders = self.model, self.model.orders[self.chosen]
-        channels, begins = model.coefficients.shape[2], model.begins
+        channels, begins = model.coefficients.shape[2], model.grid.begins
         share = np.zeros((len(model.orders), channels))
-        covariance, std, shown = np.zeros((2, model.pulses)), declared, 0.0
+        covariance, std, shown = np.zeros((2, model.grid.pulses)), declared, 0.0
         amplitudes = np.zeros((len(orders), channels), np.complex128)
         for number in range(_ITERATIONS):
-            response = model.response(errors, self.chosen, covariance=covariance)
-            before, amplitudes = amplitudes, least_squares(
-                response.signal, model.coefficients, response.expected)
-            fitted = response.signal @ real_parts(amplitudes)
-            residual = model.coefficients - fitted
+            before = amplitudes
+            response, amplitudes, residual = model.fitted(
+                errors, self.chosen, covariance=covariance)
             slope = real_parts(2j * pi * orders[:, None] * amplitudes * self.significant)
             last = response.late @ slope
             first = response.signal @ slope - last
-            variance = self._variance(residual, fitted, share, shown)
+            variance = self._variance(residual, share, shown)
             weight = 1.0 / np.sqrt(np.repeat(variance, model.sizes, axis=0))
             first *= weight
             last *= weight
             residual *= weight
-            information = Tridiagonal(np.zeros(model.pulses), np.zeros(model.pulses - 1))
+            information = Tridiagonal(np.zeros(model.grid.pulses), np.zeros(model.grid.pulses - 1))
             information.diagonal[begins] += _dot(first, first)
             information.diagonal[begins + 1] += _dot(last, last)
             information.off_diagonal[begins] = _dot(first, last)
-            pull = np.zeros(model.pulses)
+            pull = np.zeros(model.grid.pulses)
             pull[begins] += _dot(first, residual)
             pull[begins + 1] += _dot(last, residual)
             if number < _SIZE_ITERATIONS:
@@ -320,13 +315,15 @@ class PulseErrorProblem:
             converged = np.all(moved < _CONVERGED * np.abs(amplitudes[self.significant]))
             if converged and np.max(np.abs(step)) < 0.02 * np.sqrt(np.min(covariance[0])):
                 break
-        evidence = 0.5 * (self._misfit_without_errors(weight) - np.sum(residual**2)
-                          - np.sum(errors**2) / std**2) - _occam(information, std)
+        evidence = log_likelihood(information, 0.0 * pull, std) + 0.5 * (
+            self._misfit_without_errors(weight) - np.sum(residual**2)
+            - np.sum(errors**2) / std**2
+            + np.log(information.times(np.ones(len(pull))).sum()))
         alone = information.plus(_SINGULAR * (float(information.diagonal.max()) + std**-2))
         unshrunk = errors - step + alone.solve(pull)
         unit = np.mean(np.sum(response.signal[:, :, :len(orders)] ** 2, axis=1), axis=0)
         noise = np.sqrt(2.0 * variance[self.chosen] / unit[:, None])
-        plain = np.abs(least_squares(response.signal, model.coefficients))
+        plain = np.abs(least_squares(response.signal, response.signal, model.coefficients))
         size = np.abs(amplitudes)
         aligned = np.divide(plain, size, out=np.full(plain.shape, np.nan),
                             where=self.significant & (size > 0.0))
@@ -336,9 +333,8 @@ class PulseErrorProblem:
 
     def _misfit_without_errors(self, weight: FloatArray) -> float:
         """Return the weighted square of what remains of the cycles without errors of pulses."""
-        signal = self.model.response(np.zeros(self.model.pulses), self.chosen).signal
-        fitted = signal @ real_parts(least_squares(signal, self.model.coefficients))
-        return float(np.sum((weight * (self.model.coefficients - fitted)) ** 2))
+        _, _, rest = self.model.fitted(np.zeros(self.model.grid.pulses), self.chosen)
+        return float(np.sum((weight * rest) ** 2))
 
     def scan(self, width: float) -> FloatArray:
         """
@@ -348,10 +344,8 @@ class PulseErrorProblem:
         expected errors.
         """
         model, count = self.model, len(self.model.coefficients)
-        signal = model.response(np.zeros(model.pulses), self.chosen).signal
-        amplitudes = least_squares(signal, model.coefficients)
-        fitted = signal @ real_parts(amplitudes)
-        variance = self._variance(model.coefficients - fitted, fitted, np.zeros(1), 0.0)
+        _, amplitudes, rest = model.fitted(np.zeros(model.grid.pulses), self.chosen)
+        variance = self._variance(rest, np.zeros(1), 0.0)
         weighted = model.coefficients / np.repeat(variance, model.sizes, axis=0)
         reach = _SCAN_REACH * width
         steps = int(np.ceil(reach * model.orders[self.chosen].max() * _SCAN_POINTS))
@@ -363,13 +357,12 @@ class PulseErrorProblem:
             shape = np.exp(2j * pi * model.orders[i] * turns) @ model.mixing[i].T
             match = (weighted[:, :shape.shape[1]] @ amplitude).T
             score += (shape @ (match * np.exp(2j * pi * model.start[:, i]))).real
-        misfit = np.zeros((model.pulses - 1, len(levels), len(levels)))
-        misfit[model.begins] = -np.moveaxis(score.reshape(*misfit.shape[1:], count), 2, 0)
-        path, _ = shortest_path([*np.zeros((model.pulses, len(levels)))], [*misfit])
+        misfit = np.zeros((model.grid.pulses - 1, len(levels), len(levels)))
+        misfit[model.grid.begins] = -np.moveaxis(score.reshape(*misfit.shape[1:], count), 2, 0)
+        path, _ = shortest_path([*np.zeros((model.grid.pulses, len(levels)))], [*misfit])
         return np.asarray(levels[path])
 
-    def _variance(self, residual: FloatArray, fitted: FloatArray, share: FloatArray,
-                  shown: float) -> FloatArray:
+    def _variance(self, residual: FloatArray, share: FloatArray, shown: float) -> FloatArray:
         """
         Return the noise variance of one dimension (order, channel), from the median over cycles.
 
@@ -382,6 +375,7 @@ class PulseErrorProblem:
         free = size - share * shown - 2.0 / count
         variance = power / free / (1.0 - 2.0 / (9.0 * free)) ** 3  # median of chi-squared
         # Resampling and model are not exact.
+        fitted = self.model.coefficients - residual
         floor = _FLOOR**2 * np.mean(np.sum(fitted**2, axis=1), axis=0) / size
         return np.asarray(np.maximum(np.maximum(variance, floor), np.finfo(float).tiny))
 
@@ -391,40 +385,32 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum('kdc,kdc->k', a, b))
 
 
+def log_likelihood(information: Tridiagonal, right: FloatArray, size: float) -> float:
+    """
+    Return the logarithm of the likelihood of a standard deviation of pulse errors.
+
+    Errors e have the likelihood exp(right' e - e' information e / 2) and are independent and
+    normal but for a delay of all, which is unknown.
+    """
+    ones, precision = np.ones(len(right)), size**-2
+    pivots, multipliers = information.plus(precision).pivots()
+    through, common = lapack.dpttrs(pivots, multipliers, np.stack((right, ones), axis=1))[0].T
+    common = common * precision
+    delay = information.times(ones) @ common
+    return float(0.5 * (right @ through - np.log(pivots / precision).sum()
+                        + (right @ common) ** 2 / delay - np.log(delay)))
+
+
 def estimated_size(information: Tridiagonal, right: FloatArray, declared: float
                    ) -> float:
     """
-    Return the standard deviation of pulse errors.
+    Return the standard deviation of pulse errors (`log_likelihood`).
 
-    Errors e have the likelihood exp(right' e - e' information e / 2) and are independent and
-    normal but for a delay of all, which is unknown. The declared size is likely beforehand, and
-    any other from a twentieth to twenty times as large has a chance; the geometric mean over all
-    is returned. Where the vibration tells little, this is the declared size, else the one that
-    maximises the restricted likelihood.
+    The declared size is likely beforehand, and any other from a twentieth to twenty times as large
+    has a chance; the geometric mean over all is returned. Where the vibration tells little, this
+    is the declared size, else the one that maximises the restricted likelihood.
     """
-    ones = np.ones(len(right))
-    both = np.stack((right, ones), axis=1)
-    row = information.times(ones)
     sizes = declared * _SIZES
-    likelihood = np.empty(sizes.size)
-    for i, size in enumerate(sizes):
-        precision = size**-2
-        shrunk = information.plus(precision)
-        pivots, multipliers = shrunk.pivots()
-        through, common = lapack.dpttrs(pivots, multipliers, both)[0].T
-        common = common * precision
-        delay = row @ common
-        likelihood[i] = 0.5 * (right @ through - np.log(pivots / precision).sum()
-                               + (right @ common) ** 2 / delay - np.log(delay))
+    likelihood = np.array([log_likelihood(information, right, size) for size in sizes.tolist()])
     chance = np.exp(likelihood - likelihood.max()) * _CHANCES
     return float(np.exp(np.log(sizes) @ chance / chance.sum()))
-
-
-def _occam(information: Tridiagonal, std: float) -> float:
-    """Return the logarithm of prior over posterior volume of errors, without their delay."""
-    count, precision = len(information.diagonal), std**-2
-    shrunk = information.plus(precision)
-    row = information.times(np.ones(count))
-    delay = row @ shrunk.solve(np.ones(count)) * precision
-    return float(0.5 * (np.log(shrunk.pivots()[0] / precision).sum()
-                        + np.log(delay / row.sum())))

@@ -19,11 +19,10 @@ number of pulses.
 
 Only orders above the noise are used, each channel and order with the weight of its noise. An order
 whose phase the errors may turn by half a cycle is used only after lower orders have limited the
-errors. An order of another shaft beside one that is used would pass for errors: it is found by
-what it does to the length of that order, and fitted with it (`orders_beside`). The size of the
-errors is estimated with them. Where the vibration tells less of a pulse, its expected error is
-smaller, so that noise is not aligned to itself. A delay common to all pulses cannot be recovered:
-the errors have mean zero.
+errors. An order of another shaft beside one that is used passes for errors unless it is known, and
+fitted with it (`other_lines`). The size of the errors is estimated with them. Where the vibration
+tells less of a pulse, its expected error is smaller, so that noise is not aligned to itself. A
+delay common to all pulses cannot be recovered: the errors have mean zero.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,8 +35,7 @@ from sa_jitter_ros.averaging.alignment import Alignment, alignment
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
-from sa_jitter_ros.averaging.synchronous_orders import (LineSearch, orders_beside,
-                                                        significant_orders)
+from sa_jitter_ros.averaging.synchronous_orders import LineSearch, significant_orders
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 # The width of a uniform distribution in its standard deviations.
@@ -46,8 +44,6 @@ _UNIFORM_WIDTH = float(np.sqrt(12.0))
 _SAFE_TURNS, _MOST_TURNS = 0.5, 1.1
 # Width of the interval that a fitted error is expected in, in its standard errors.
 _CERTAIN = 5.0
-#: Largest standard error of an error that single pulses resolve, over the size of the errors.
-LARGEST_ERROR = 0.7
 # Least share of the variance of the errors that the vibration must show.
 _LEAST_SHOWN = 0.05
 # Errors that are so many times as large as declared, and turn an order across their width so far,
@@ -157,18 +153,10 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     """
     periods = _validated(grid.cycles, periods, cycle_length, declared_standard_deviation)
     declared = declared_standard_deviation * cycle_length / float(np.mean(periods))
-    attempt = partial(
+    found = _likeliest(partial(
         _staged_fit, grid, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
-        additional_orders=additional_orders, most_orders=most_orders, declared=declared)
-    found = _likeliest(attempt, declared)
+        additional_orders=additional_orders, most_orders=most_orders, declared=declared), declared)
     problem, fit, reason = found.problem, found.fit, found.reason
-    if problem is not None and fit is not None:
-        beside = orders_beside(problem, fit.expected, cycle_length)
-        if beside.size:
-            again = _likeliest(partial(
-                attempt, orders=np.union1d(fit.orders, beside)), declared)
-            if again.fit is not None:
-                problem, fit = again.problem, again.fit
     if problem is None or fit is None:
         count, channels = grid.pulses, grid.cycles.shape[2]
         return PulseErrorRecovery(

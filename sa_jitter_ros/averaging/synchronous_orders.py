@@ -28,12 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import BAND, cycle_weights, GridCycles
 from sa_jitter_ros.averaging.noise import long_run_variance
-from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
-                                                     least_squares, PulseErrorProblem,
-                                                     real_parts)
-from scipy.fft import fft, rfft
+from sa_jitter_ros.averaging.pulse_error_fit import CompressedCycles
 from scipy.ndimage import median_filter
-from scipy.special import betainc
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -49,9 +45,6 @@ _COHERENCE = 0.15
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
 _POLE = 1e-8  # lines that are no nearer to a bin: there the lobe is a quotient of two zeros
-# Cycles from which on a tone in them can be told, and its least amplitude over that of the order:
-# a weaker one moves the errors so little that amplitudes at three times the order change by 0.2 %.
-_LEAST_CYCLES, _LEAST_TONE = 8, 0.02
 _CLEAR = 100.0  # times the power of the orders around
 # Candidates, over those wanted, whose lines are separated, and how far apart they must be.
 _TOGETHER, _APART = 2, 0.02
@@ -151,15 +144,11 @@ class LineSearch:
         Orders are weighted by their square, as in the fit of the errors. True pulse errors can
         only give a value above 1; without orders it is 1.
         """
-        before, after = (self.power(item, orders, tapered=False)
+        before, after = (np.abs(self._lines(item, orders, tapered=False)) ** 2
                          for item in (0.0 * errors, errors))
         weight = orders[:, None] ** 2 / np.maximum(np.sum(before, axis=0), np.finfo(float).tiny)
         known = float(np.sum(weight * before))
         return float(np.sum(weight * after)) / known if known else 1.0
-
-    def power(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> FloatArray:
-        """Return an array (order, channel), the power of orders `g` without `errors` (pulse,)."""
-        return np.asarray(np.abs(self._lines(errors, g, tapered=tapered)) ** 2)
 
     def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
         channels = self.spectra.shape[2]
@@ -201,93 +190,17 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     with the mean, where pulse errors, which may be correlated too, have no effect to first order.
     """
     count, _, channels = model.coefficients.shape
-    amplitudes, deviation, in_phase = _deviations(model, errors, np.arange(len(model.orders)))
+    response, amplitudes, rest = model.fitted(errors, np.arange(len(model.orders)))
+    parts = np.matmul(response.signal.transpose(0, 2, 1), rest)
+    parts /= np.sum(response.signal**2, axis=1)[:, :, None]
+    deviation = parts[:, :len(amplitudes)] + 1j * parts[:, len(amplitudes):]
+    in_phase = (deviation * np.exp(-1j * np.angle(amplitudes))).real
     power = np.abs(amplitudes) ** 2
     scatter = np.sum(np.abs(deviation) ** 2, axis=0) / (count - 1)
     ringing = np.maximum(scatter, 2.0 * long_run_variance(in_phase))
     limit = significance(tests * channels, count)
     return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
-
-
-def _deviations(model: CompressedCycles, errors: FloatArray, chosen: NDArray[np.intp]
-                ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-    """
-    Return amplitudes (order, channel) without pulse `errors`, and how single cycles deviate.
-
-    The deviations (cycle, order, channel) are also given in phase with the amplitudes.
-    """
-    signal = model.response(errors, chosen).signal
-    amplitudes = least_squares(signal, model.coefficients)
-    found = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
-    return amplitudes, found, (found * np.exp(-1j * np.angle(amplitudes))).real
-
-
-def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: float
-                  ) -> FloatArray:
-    """
-    Return where an order of another shaft may lie beside those of a fit, empty if nowhere.
-
-    Pulse `errors` turn an order from cycle to cycle and hardly change its length. An order beside
-    it does both, at the rate of their distance. An F test thus looks for a tone in the lengths
-    that are left of each order, in the channels where it is significant. Whole turns and the sign
-    of the rate do not show: of the largest tone, the four nearest orders are returned.
-    """
-    model, chosen, numbers = problem.model, problem.chosen, problem.model.numbers
-    count, orders = len(numbers), model.orders[chosen]
-    if count < _LEAST_CYCLES:
-        return np.empty(0)
-    span = int(numbers[-1]) + 1
-    amplitudes, _, lengths = _deviations(model, errors, chosen)
-    rates = np.arange(1, 2 * span) / (4.0 * span)  # a quarter of a turn of all cycles apart
-    there = np.zeros(span)
-    there[numbers] = 1.0
-    sums = fft(there, 4 * span)
-    turning = sums[1:2 * span], sums[2:4 * span:2]
-    level, largest, found = _FALSE_ALARM / (count * orders.size), 0.0, np.empty(0)
-    for order, told, series, size in zip(orders, problem.significant,
-                                         lengths.transpose(1, 0, 2), np.abs(amplitudes)):
-        series, channels = series[:, told], int(told.sum())
-        series = series - series.mean(axis=0)
-        whole = np.zeros((span, channels))
-        whole[numbers] = series
-        shares = _shares(series, turning, rfft(whole, 4 * span, axis=0)[1:-1])
-        place = int(np.argmax(shares))
-        power = shares[place] * np.sum(series**2)
-        # of 2 and count - 3 degrees of freedom in each channel
-        chance = betainc(0.5 * channels * (count - 3), channels, 1.0 - shares[place])
-        least = 0.5 * count * np.sum((_LEAST_TONE * size[told]) ** 2)
-        if chance < level and power > max(largest, least):
-            near = rates[place] + np.linspace(-1.0, 1.0, 21) * rates[0]
-            near = near[(near > 0.5 * rates[0]) & (near < 0.5 - 0.5 * rates[0])]
-            waves = np.exp(-2j * pi * np.multiply.outer(near, numbers))
-            both = waves.sum(axis=1), (waves**2).sum(axis=1)
-            rate = near[int(np.argmax(_shares(series, both, waves @ series)))]
-            if rate > 0.5 - rates[0]:  # the cycles do not tell it from half a turn
-                rate = 0.5
-            largest = power
-            found = order + np.array((rate - 1.0, -rate, rate, 1.0 - rate)) / cycle_length
-    return found
-
-
-def _shares(series: FloatArray, turning: tuple[ComplexArray, ComplexArray], lines: ComplexArray
-            ) -> FloatArray:
-    """
-    Return the share (rate,) of `series` (cycle, channel) that tones have, all channels alike.
-
-    The series have no mean; `lines` (rate, channel) are their Fourier sums, `turning` those of 1,
-    at the same rates and at twice these. A tone is any sum of a cosine and a sine without their
-    means.
-    """
-    count, (once, twice) = len(series), turning
-    cosines = 0.5 * (count + twice.real) - once.real**2 / count
-    sines = 0.5 * (count - twice.real) - once.imag**2 / count
-    both = 0.5 * twice.imag - once.real * once.imag / count
-    along, across = lines.real, lines.imag
-    power = (sines[:, None] * along**2 + cosines[:, None] * across**2
-             - 2.0 * both[:, None] * along * across) / (cosines * sines - both**2)[:, None]
-    whole = np.maximum(np.sum(series**2, axis=0), np.finfo(float).tiny)
-    return np.asarray(np.clip(np.mean(power / whole, axis=1), 0.0, 1.0))
 
 
 def significance(tests: int, cycles: int) -> float:

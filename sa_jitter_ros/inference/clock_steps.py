@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.spectral_lines import top_between
 from sa_jitter_ros.inference.cycle_reader import CycleReader
-from sa_jitter_ros.inference.line_search import top_between
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -152,7 +152,7 @@ class _Phasors:
             return float(self.delays[best])
         near = near[np.argsort(self.delays[near])]
         low, middle, high = likely[near]
-        off = top_between(likely[near]) if low + high < 2.0 * middle else 0.0
+        off = float(top_between(likely[near])) if low + high < 2.0 * middle else 0.0
         return float(self.delays[near[1]] + off * (self.delays[near[1]] - self.delays[near[0]]))
 
     def period(self, before: tuple[int, int], after: tuple[int, int]) -> float | None:

@@ -24,11 +24,11 @@ estimated with them (expectation-maximisation).
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.bordered import Solved
@@ -358,7 +358,7 @@ class States:
         for c, weight in enumerate(self.weight):
             for which, item in enumerate(derivative):
                 states = [i for i, own in enumerate(by) if own == which]
-                found = self._sums_of(item[c], which, c, self.shapes[states])
+                found = self.sums(item[c], self.shapes[states])
                 found *= weight
                 for i, row in zip(states, np.moveaxis(found, 1, 0)):
                     place = border[1:, 0, c] if i == width else border[:-1, i, c]
@@ -370,20 +370,6 @@ class States:
         flat = np.pad(corner.reshape(below.size, -1), (0, 1))
         flat[np.diag_indices(len(flat))] *= 1.0 + ROUNDING
         return whole, flat, np.append(below, 0.0)
-
-    def _sums_of(self, values: Array, which: int, channel: int, shapes: Array) -> ComplexArray:
-        """Return `sums` of a derivative (cycle, point) of a channel, from its lines if faster."""
-        n = self.orders.size
-        if self.tones.size or 2 * n >= self.u.size:
-            return self.sums(values, shapes)
-        part = (self.moved * self.amplitudes[channel]) * (self.turn if which else (
-            2j * np.pi * self.slope[:, None] * self.orders * self.turn))
-        wave = (shapes[:, None] * self.wave).reshape(-1, self.u.size)
-        each = np.ascontiguousarray(self.reading @ wave.T).view(np.float64)
-        found = (part.view(np.float64) @ each).view(np.complex128).reshape(
-            len(part), len(shapes), n)
-        found *= self.turn[:, None]
-        return np.asarray(found)
 
     def variance(self, state: int) -> float:
         """Return the variance of a state of most cycles; that of errors is about their trend."""
@@ -458,9 +444,3 @@ def _products(parts: Array) -> tuple[ComplexArray, ComplexArray]:
     """Return products of waves, and those with the conjugate, of cosines and sines in turn."""
     cos, sin = parts[::2].view(np.complex128), parts[1::2].view(np.complex128)
     return cos + 1j * sin, (cos - 1j * sin).conj()
-
-
-@lru_cache(maxsize=4)
-def hann(count: int) -> Array:
-    """Return the periodic Hann window (count,)."""
-    return np.hanning(count + 1)[:-1]

@@ -21,101 +21,71 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.noise import row_medians
+from sa_jitter_ros.averaging.spectral_lines import (
+    FALSE, line_limit, peaks, spectrum, top_between)
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.path_delay import USUAL_DELAY
-from sa_jitter_ros.inference.cycle_states import hann, States
+from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.prediction.influence import trigger_periods
 from sa_jitter_ros.pulses.resampling import interpolate
-from scipy.fft import fft, next_fast_len, rfft
-from scipy.special import gammaincc, gammainccinv
+from scipy.fft import fft, next_fast_len
+from scipy.special import gammaincc
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
 _MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
-# A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
-# it must not be far below the strongest, which may leave images of itself.
-FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
+# A line is not far below the strongest, which may leave images of itself.
+_SHARE = 0.3
 _HANN = 1.5  # bins of noise in one of the window
 _MISSED = 1e-3  # share of the power of a tone that the frequencies tried for it may miss
 _SHARPER = 1.3  # in power, over angle than over time or the reverse
 _FEWEST_SIDES = 3  # lines as far from declared ones that show a shaft
 #: Bins between lines, or cycles in a stretch between waves, that are told apart.
 APART = 1.5
-_ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
 _FINE = 0.3  # bins between frequencies that are tried
-_SKIRT = 24  # bins beside a line, of which the median is the floor; half an order is one, too
+_SKIRT = 24  # bins beside a line that it may share with others
 _SLOPE_GAIN = 0.7
 _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
 
 
 def follow_trend(states: States, expected: float) -> int:
     """
-    Start from the slope of the errors that keeps the declared lines together.
+    Start from the slope of the errors, or the delay, that keeps the declared lines together.
 
-    A clock that is fast or slow, or a wrong ratio, makes it. It is the `expected` one where
-    no other is clearly better. How many were tried is returned.
+    A clock that is fast or slow, or a wrong ratio, makes a slope, and a delay errors that follow
+    the speed. The slope is the `expected` one where nothing else is clearly better. How many were
+    tried is returned.
     """
-    span = states.cycle_length * states.transformed
-    flat = states.vibration[:, :states.transformed].reshape(len(states.vibration), -1)
-    spectrum = np.abs(np.fft.rfft(flat * np.hanning(flat.shape[1]))).T ** 2
-    power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
-    step = _FINE / states.orders.max() / span
-    most = int(USUAL_SKEW / step)
-    slope = step * np.arange(-most, most + 1)
-    score = np.sum([np.log(1e-3 * power.max() + np.interp(
-        g * (1.0 + slope) * span, np.arange(power.size), power)) for g in states.orders],
-        axis=0)
-    best = slope[np.argmax(score)]
-    before = score[np.argmin(np.abs(slope - expected))]
-    ratio = sum(item * np.log(2.0) / _medians(item, max(int(span / 2), _SKIRT))
-                for item in spectrum.T)
-    places = np.rint(states.orders * (1.0 + best) * span).astype(int)
-    chance = gammaincc(spectrum.shape[1], ratio[places])
-    clear = (score.max() - before > _SLOPE_GAIN * states.declared
-             and abs(best - expected) > 1.5 * step
-             and np.mean(chance < FALSE / slope.size) > _SLOPE_LINES)
-    states.trend = float(best) if clear else expected
-    states.states[:, 0] = states.no_jitter
-    states.read()
-    return len(slope)
-
-
-def follow_speed(states: States) -> int:
-    """
-    Start from the delay, or clock skew, that keeps the declared lines together as speeds change.
-
-    It is 0 where no other is clearly better. How many were tried is returned.
-    """
-    period = trigger_periods(states.times)
-    pace, since = states.cycle_length / period, states.times - states.times[0]
-    if float(np.ptp(pace)) * states.orders.max() * USUAL_DELAY < _FINE:
-        return 1
+    pace = states.cycle_length / trigger_periods(states.times)
+    since = states.times - states.times[0]
     states.make_tables()
     each = np.stack([states.sums(row) for row in states.vibration]).conj()
+    each *= np.exp(-2j * np.pi * expected * np.outer((pace * since)[:-1], states.orders))
     count, best = 1, _SLOPE_GAIN * states.declared
-    for moved, most in ((np.ones(period.size), USUAL_DELAY), (since, USUAL_SKEW)):
-        turned = pace * moved
-        step = _FINE / (states.orders.max() * float(np.ptp(turned)))
-        if step > most:
+    slope, errors = expected, expected * since
+    for moved, most in (since, USUAL_SKEW), (np.ones(since.size), USUAL_DELAY):
+        most_turns = states.orders.max() * float(np.ptp(pace * moved))
+        if most * most_turns < _FINE:
             continue
-        tried = step * np.arange(-int(most / step), int(most / step) + 1)
-        power = np.array([_coherence(each[:, :, g], order * turned[:-1], tried)
+        places = int(most * most_turns / _FINE)
+        tried = _FINE / most_turns * np.arange(-places, places + 1)
+        power = np.array([_coherence(each[:, :, g], order * (pace * moved)[:-1], tried)
                           for g, order in enumerate(states.orders)])
         score = np.sum(np.log(1e-3 * power.max() + power), axis=0)
         top = int(np.argmax(score))
         chance = gammaincc(len(each), power[:, top])
-        gained = score[top] - score[tried.size // 2]
+        gained = score[top] - score[places]
         if gained > best and np.mean(chance < FALSE / tried.size) > _SLOPE_LINES:
-            best, errors = gained, tried[top] * moved
-            states.by_speed = errors - errors.mean() * states.common_turn
+            best, errors = gained, expected * since + tried[top] * moved
+            slope = expected + tried[top] * (moved is since)
         count += tried.size
-    if states.by_speed.any():
-        states.states[:, 0] = states.by_speed
-        states.read()
+    states.trend = float(slope)
+    states.by_speed = errors - errors.mean() * states.common_turn - slope * states.ramp
+    states.states[:, 0] = states.no_jitter
+    states.read()
     return count
 
 
@@ -147,20 +117,16 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
     duration = float(time[-1] - time[0])
     at = np.interp(np.linspace(time[0], time[-1], time.size), time, np.arange(time.size))
     even = interpolate(flat, np.clip(at, 0.0, time.size - 1.0))
-    least = _ACCURACY * np.sqrt(np.mean(states.vibration**2, axis=(1, 2)))
-    over_angle, over_time = (_spectrum(item, span, least) for item in (flat, even))
-    limit = gammainccinv(flat.shape[1], FALSE / len(over_angle[0])) * _MARGIN
+    size = np.sqrt(np.mean(states.vibration**2, axis=(1, 2)))
+    over_angle, over_time = (spectrum(item, span, size) for item in (flat, even))
+    limit = line_limit(flat.shape[1], len(over_angle[0]))
     found: list[tuple[float, float, bool]] = []
     for tone, (ratio, power), (_, other) in ((False, over_angle, over_time),
                                              (True, over_time, over_angle)):
-        middle = ratio[1:-1]
-        peaks = 1 + np.flatnonzero((middle > ratio[:-2]) & (middle >= ratio[2:])
-                                   & (middle > limit))
-        order = peaks / span
-        for peak in peaks[(order > 3.0 / span) & (order < states.highest)]:
+        for peak, place in zip(*peaks(ratio, limit)):
             near = other[max(peak - 8, 0):peak + 9].max()
-            if power[peak] > near * (_SHARPER if tone else 1.0 / _SHARPER):
-                place = top_between(np.log(ratio[peak - 1:peak + 2])) + peak
+            if 3 < peak < states.highest * span and (
+                    power[peak] > near * (_SHARPER if tone else 1.0 / _SHARPER)):
                 found.append((power[peak], place / (duration if tone else span), tone))
     found.sort(reverse=True)
     orders: list[float] = []
@@ -185,8 +151,7 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
 
 def least_seen(samples: float, channels: int) -> float:
     """Return the least amplitude of a line on all channels that is found, over its error."""
-    power = _MARGIN * float(gammainccinv(channels, FALSE / samples)) / channels
-    return float(np.sqrt(2.0 * _HANN * power))
+    return float(np.sqrt(2.0 * _HANN * line_limit(channels, samples) / channels))
 
 
 def add_lines(states: States, orders: Sequence[float] | Array,
@@ -356,40 +321,7 @@ def _both_ways(states: States) -> tuple[Array, Array, Array]:
         found = np.abs(tried @ beside.T) ** 2 @ weights
         best = int(np.argmax(found))
         near = np.log(found[best - 1:best + 2])
-        off = step * (best - reach + (top_between(near) if near.size == 3 else 0.0))
+        off = step * (best - reach + (float(top_between(near)) if near.size == 3 else 0.0))
         over_time[k] = weights @ np.abs(beside @ np.exp(-2j * np.pi * off * middle)) ** 2
         tones[k] = states.orders[i] * states.frequency + off
     return over_angle, over_time, tones
-
-
-def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
-    """
-    Return power over its floor, summed over channels (last axis), and power (bin,).
-
-    The floor of a channel is at least the power of a line of the amplitude `least` (channel,).
-    """
-    window = hann(len(values))
-    lines = rfft(values.T * window)
-    power = lines.real**2 + lines.imag**2
-    ratio = np.zeros(power.shape[1])
-    for channel, limit in zip(power, (0.5 * least * window.sum()) ** 2):
-        floor = np.full(channel.size, limit)
-        for reach in (max(int(span / 2), _SKIRT), _SKIRT):
-            np.maximum(floor, _medians(channel, reach), out=floor)
-        ratio += channel * np.log(2.0) / floor
-    return ratio, power.sum(axis=0)
-
-
-def _medians(power: Array, reach: int) -> Array:
-    """Return the median of the values up to `reach` bins away, between some bins linearly."""
-    size, step = min(2 * reach, len(power)), max(1, reach // 2)
-    medians = row_medians(np.lib.stride_tricks.sliding_window_view(power, size)[::step])
-    inner = np.linspace(medians[:-1], medians[1:], step, endpoint=False, axis=1).ravel()
-    return np.pad(inner, (size // 2, len(power) - size // 2 - inner.size), mode='constant',
-                  constant_values=(medians[0], medians[-1]))
-
-
-def top_between(values: Array) -> float:
-    """Return where a parabola through three values has its top, from the middle one."""
-    left, middle, right = values
-    return float(0.5 * (left - right) / (left - 2.0 * middle + right))

@@ -22,11 +22,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
-    add_lines, FALSE, fit_lines, follow_speed, follow_trend, let_stand, new_lines, prune, refine,
-    with_a_shaft)
+    add_lines, fit_lines, follow_trend, let_stand, new_lines, prune, refine, with_a_shaft)
 from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
@@ -100,7 +100,7 @@ class OpenRecord:
         band = OrderBand.below(top * cycle_length, samples, sample_rate, start_time, times)
         self._begin = States(
             band, times, measured, cycle_length, np.array(orders), top, jitter_std)
-        self._false_alarm = FALSE / follow_speed(self._begin) / follow_trend(self._begin, trend)
+        self._false_alarm = FALSE / follow_trend(self._begin, trend)
 
     def fit(self, known: tuple[Array, Array] | None = None) -> RecordFit:
         """

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, band_of_ripple, ripple_correlation, slow_band, WIDEST)
@@ -37,7 +38,7 @@ from sa_jitter_ros.effects.lattice import (
     Clock, coarsest_clock, ROOM, SAME_RATE, smooth_on_grid)
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
-from sa_jitter_ros.inference.cycle_states import hann, independent_power
+from sa_jitter_ros.inference.cycle_states import independent_power
 from sa_jitter_ros.inference.line_search import APART, nearest_orders
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
