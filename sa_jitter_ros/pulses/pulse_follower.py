@@ -34,10 +34,10 @@ import math
 import numpy as np
 from sa_jitter_ros.pulses.alternation import Alternation
 from sa_jitter_ros.pulses.interval_model import IntervalModel
+from sa_jitter_ros.pulses.mark_corrector import PulseSink
 from sa_jitter_ros.pulses.mark_pattern import mark_pattern
 from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
 from sa_jitter_ros.pulses.target import Lock
-from sa_jitter_ros.pulses.trigger_counter import PulseSink
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
 _MOST_WAITING = 10  # doubtful pulses, until the match is lost

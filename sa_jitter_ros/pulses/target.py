@@ -18,7 +18,6 @@ tells which tooth caused each of them.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -104,24 +103,6 @@ def index_of(steps: IntArray) -> int:
     It is the one behind the widest gap; of several, the one behind the widest teeth before it.
     """
     return max(range(steps.size), key=lambda k: tuple(np.roll(steps, -k)[::-1]))
-
-
-class Target(Protocol):
-    """What the pulse validator needs to know of a target."""
-
-    marks: int
-    memory: int
-
-    def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
-                  ) -> int:
-        """
-        Return how many of the waiting pulses to match next, after the first `tried` ones.
-
-        It `failed` so often before, or found a lock that was lost soon.
-        """
-
-    def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
-        """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
 
 
 class EvenTarget:
@@ -251,3 +232,6 @@ class ToothedWheel:
         next_to_gap = np.roll(gap, 1) | np.roll(gap, -1)
         tolerance = np.where(next_to_gap, max(self._tolerance, _BESIDE_GAP), self._tolerance)
         return np.where(gap, np.minimum(_BESIDE_GAP, _ACROSS_GAP / steps), tolerance)
+
+
+Target = EvenTarget | ToothedWheel
