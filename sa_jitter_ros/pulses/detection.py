@@ -25,13 +25,14 @@ import warnings
 
 import numpy as np
 import numpy.typing as npt
-from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
-from sa_jitter_ros.parameters import number
+from sa_jitter_ros.errors import DataWarning, SignalError
+from sa_jitter_ros.parameters import number, Values
+from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS, OPTIONS
 from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
 from sa_jitter_ros.samples import SampleBlock
 
-__all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'pulses_in_blocks',
-           'spikes_text']
+__all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'detector_of',
+           'pulses_in_blocks', 'spikes_text']
 
 FloatArray = npt.NDArray[np.float64]
 Polarity = Literal['positive', 'negative', 'auto']
@@ -115,21 +116,11 @@ class KeyphasorDetector:
         edge: Edge = 'rising', interpolate: bool = True,
         minimum_interval: float = 0.0, learning_time: float = 0.5, minimum_difference: float = 0.0,
     ) -> None:
-        if threshold is not None and not np.isfinite(threshold):
-            raise ParameterError(f'threshold {threshold} is not finite: give a level, or None')
-        if not 0.0 <= hysteresis < 1.0:
-            raise ParameterError(f'hysteresis {hysteresis} is outside 0 <= hysteresis < 1: '
-                                 'give a fraction of the difference of the state levels')
-        if polarity not in ('positive', 'negative', 'auto'):
-            raise ParameterError(f"polarity '{polarity}': use 'positive', 'negative' or 'auto'")
-        if edge not in ('rising', 'falling', 'centre'):
-            raise ParameterError(f"edge '{edge}': use 'rising', 'falling' or 'centre'")
-        if not 0.0 < learning_time < np.inf:
-            raise ParameterError(f'learning_time {learning_time} s must be finite and above 0')
-        for name, value in (('minimum_interval', minimum_interval),
-                            ('minimum_difference', minimum_difference)):
-            if not 0.0 <= value < np.inf:
-                raise ParameterError(f'{name} {value} must be finite and not negative')
+        given = {'hysteresis': hysteresis, 'polarity': polarity, 'edge': edge,
+                 'minimum_interval': minimum_interval, 'learning_time': learning_time,
+                 'minimum_difference': minimum_difference, 'threshold': threshold or 0.0}
+        for item in DETECTOR_PARAMETERS:
+            item.convert(given.get(item.name, item.default))
         self._polarity = polarity
         self._given_threshold = threshold
         self._hysteresis = hysteresis
@@ -372,6 +363,13 @@ def _last(pieces: list[Piece], count: int) -> list[Piece]:
     return kept[::-1]
 
 
+def detector_of(values: Values) -> KeyphasorDetector:
+    """Return the detector with these parameters; raises `ParameterError`."""
+    return KeyphasorDetector(
+        threshold=None if values['automatic_threshold'] else values['threshold'],
+        **{name: values[name] for name in OPTIONS})
+
+
 def pulses_in_blocks(detector: KeyphasorDetector, blocks: Iterable[SampleBlock]) -> FloatArray:
     """Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap."""
     found = [detector.update(part.samples[0], part.start_time, part.sample_rate)
@@ -417,11 +415,9 @@ def detect_pulses(
     True
     """
     detector = KeyphasorDetector(
-        threshold=None if threshold is None else number('threshold', threshold),
-        hysteresis=number('hysteresis', hysteresis), polarity=polarity, edge=edge,
-        interpolate=interpolate, minimum_interval=number('minimum_interval', minimum_interval),
-        learning_time=number('learning_time', learning_time),
-        minimum_difference=number('minimum_difference', minimum_difference))
+        threshold=threshold, hysteresis=hysteresis, polarity=polarity, edge=edge,
+        interpolate=interpolate, minimum_interval=minimum_interval, learning_time=learning_time,
+        minimum_difference=minimum_difference)
     sample_rate = number('sample_rate', sample_rate)
     start_time = number('start_time', start_time)
     samples = np.asarray(tach)

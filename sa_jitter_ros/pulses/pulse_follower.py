@@ -32,7 +32,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from sa_jitter_ros.pulses.alternation import Alternation
 from sa_jitter_ros.pulses.interval_model import IntervalModel
 from sa_jitter_ros.pulses.mark_corrector import PulseSink
 from sa_jitter_ros.pulses.mark_pattern import mark_pattern
@@ -56,6 +55,9 @@ REVOLUTIONS = 5
 #: intervals by which a gap may differ from a whole number of them
 NEAR_WHOLE = 0.2
 _NEVER = 1 << 62
+# Intervals that show whether every other one is longer: by how much at least, and by how many
+# times their variance.
+_TURNS, _LEAST_TURNS, _SURE_TURNS = 256, 2e-5, 100.0
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class PulseFollower:
         self.times: list[float] = []
         self._learnt = 0  # times that the pattern was learnt
         self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
-        self._alternation = Alternation()
+        self._alternates = False
         self._recent: list[float] = []  # of the latest pulses, dropped ones too
         verdicts.counts['accepted'] += 1
         self.confirmed = queue.pop(0)
@@ -160,11 +162,16 @@ class PulseFollower:
 
     def _look_at_turns(self, levels: list[float]) -> None:
         """Say that intervals of one mark are longer and shorter in turns."""
-        known = self._alternation.size
-        self._alternation.update(levels)
-        size = abs(self._alternation.size)
-        if not size or known or self._probe or self._model.has_tick:
+        self.levels += levels
+        if self._probe or len(self.levels) < _TURNS:
             return
+        every = np.array(self.levels)
+        pattern = mark_pattern(np.arange(every.size) % 2, every, 2, significant=_SURE_TURNS)
+        size = 0.0 if pattern is None else abs(float(pattern.widths[0]))
+        self.levels = []
+        if size < _LEAST_TURNS or self._alternates or self._model.has_tick:
+            return
+        self._alternates = True
         usual = math.exp(0.5 * (self._model.level + self._model.before))
         self._verdicts.say(
             f'the pulse intervals are longer and shorter in turns, {usual * math.exp(size):.6g} s '
@@ -394,7 +401,8 @@ class PulseFollower:
 
     def _next(self, slots: list[int], level: float) -> float:
         """Take the first pulse out of the queue as the one at the end of these slots."""
-        self._alternation = Alternation()
+        if self._lock.steps.size == 1:
+            self.levels, self._alternates = [], False
         pulse = self._queue.pop(0)
         self._remember(pulse)
         self._verdicts.counts['accepted'] += 1
