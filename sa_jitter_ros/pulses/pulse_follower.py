@@ -172,7 +172,7 @@ class PulseFollower:
         if size < _LEAST_TURNS or self._alternates or self._model.has_tick:
             return
         self._alternates = True
-        usual = math.exp(0.5 * (self._model.level + self._model.before))
+        usual = math.exp(0.5 * sum(self._model.recent[-2:]))
         self._verdicts.say(
             f'the pulse intervals are longer and shorter in turns, {usual * math.exp(size):.6g} s '
             f'and {usual * math.exp(-size):.6g} s: are they pulses of two keyphasors of one name, '
@@ -212,8 +212,7 @@ class PulseFollower:
         if self._is_of_clock():
             return True
         rules = self._rules()
-        paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent,
-                      using=model.chosen, slowed=model.slowed)]
+        paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent, using=model.chosen)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
             paths = rules.extend(paths, pulse)
             if (number or len(queue) == 1) and self._commit(paths, final):
@@ -280,7 +279,6 @@ class PulseFollower:
     def _drop_stray(self) -> None:
         gap = self._queue[0] - self.confirmed
         expected = math.exp(self._model.expected) * float(self._lock.widths[self.slot])
-        self._model.refuse(gap / expected - 1.0)
         self._drop('doubles' if gap < 0.5 * expected else 'early')
         recent = np.diff(self._recent)
         mean = float(recent.mean()) if recent.size == _AGREEING else np.inf
@@ -335,8 +333,6 @@ class PulseFollower:
                 self._sink.begin(pulse, 0, passed=steps)
             return
         self._verdicts.reject(self._queue[0], 'late')
-        if mark == 1:
-            model.refuse(deviation)
         if not known and mark == 1 and after is not None:
             passed = self._slots_in(gap, model.level, self.slot)
             if passed and passed == self._slots_in(gap, after, self.slot):
