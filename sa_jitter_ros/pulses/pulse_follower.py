@@ -305,19 +305,15 @@ class PulseFollower:
         model, tolerance = self._model, self._tolerance
         slots, steps = self._passed(mark)
         gap = self._queue[0] - self.confirmed
-        regular = abs(deviation) <= tolerance
-        known = self._is_whole(gap, slots, model.level) and (
-            after is None or self._is_whole(gap, slots, after))
         if mark == 1 and after is not None and abs(math.expm1(level - model.level)) <= max(
                 _RAMP, self._options.tolerance):
             low, high = sorted((model.level, after))
-            changes = low - tolerance <= level <= high + tolerance  # the speed does
-            if changes:
+            if low - tolerance <= level <= high + tolerance:  # the speed changes
                 pulse = self._next(slots, level)
                 model.jump(level)
                 self._sink.extend([pulse], [steps])
                 return
-        if mark > 1 and regular:
+        if mark > 1 and abs(deviation) <= tolerance:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
             self._verdicts.counts[kind] += mark - 1
             self._verdicts.rejected += [
@@ -325,19 +321,18 @@ class PulseFollower:
                 for number in range(1, min(mark, _MOST_WAITING))]
             pulse = self._next(slots, level)
             model.accept([level])
-            if self._lacks_alike(mark, gap):
+            if self._lacks_alike(mark, gap) or not self._options.bridge:
                 self._sink.begin(pulse, 0, passed=steps)
-            elif self._options.bridge:
-                self._sink.extend([pulse], [steps])
             else:
-                self._sink.begin(pulse, 0, passed=steps)
+                self._sink.extend([pulse], [steps])
             return
         self._verdicts.reject(self._queue[0], 'late')
-        if not known and mark == 1 and after is not None:
-            passed = self._slots_in(gap, model.level, self.slot)
-            if passed and passed == self._slots_in(gap, after, self.slot):
-                slots, steps = self._passed(passed)
-                known = True
+        passed = self._slots_in(gap, model.level, self.slot)
+        if after is not None and passed != self._slots_in(gap, after, self.slot):
+            passed = 0
+        known = passed == mark or (mark == 1 and after is not None and passed > 0)
+        if known:
+            slots, steps = self._passed(passed)
         # A step of the time may be whole by chance: uneven marks tell which of them comes next.
         long = gap > _LONG * float(self._lock.widths.sum()) * math.exp(model.level)
         if (not known or long) and (self._probe or not self._lock_is_plain):
@@ -424,11 +419,6 @@ class PulseFollower:
         if abs(float(ends[nearest]) - rest) > NEAR_WHOLE:
             return 0
         return int(turns) * widths.size + nearest
-
-    def _is_whole(self, gap: float, slots: list[int], level: float) -> bool:
-        """Whether intervals of this level make the gap (s) the whole number of teeth."""
-        width = float(self._lock.widths[slots].sum())
-        return abs(gap / math.exp(level) - width) <= NEAR_WHOLE
 
     @property
     def _room_of_marks(self) -> int:
