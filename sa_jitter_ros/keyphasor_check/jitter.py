@@ -29,7 +29,6 @@ _FEWEST = 24
 _LOWEST = 0.02  # cycles a pulse, below which the motion has any spectrum
 _MOST = 65_536
 _BINS = 300
-_STARTS = (0.0, 0.4, -0.4)  # in parts of the bound
 _INFLATION = 1.5  # neighbouring lines of a Hann window are correlated
 _BOUND = 1.5  # of the inverse hyperbolic tangent of the correlation
 _LEAST = 0.02  # of the scatter of the pulses beside their neighbours: less is no jitter found
@@ -93,10 +92,9 @@ def measure_jitter(true: FloatArray, numbers: NDArray[np.int64]) -> Jitter | Non
     from scipy import optimize  # which loads long, for programs that fit nothing
 
     def fitted(bound: float) -> tuple[FloatArray, FloatArray]:
-        best = min((optimize.minimize(
-            deviance, np.array([0.0, -6.0, start * bound]), method='L-BFGS-B',
-            bounds=((-25.0, 15.0), (-35.0, 10.0), (-bound, bound))) for start in _STARTS),
-            key=lambda item: float(item.fun))
+        best = optimize.minimize(
+            deviance, np.array([0.0, -6.0, 0.0]), method='L-BFGS-B',
+            bounds=((-25.0, 15.0), (-35.0, 10.0), (-bound, bound)))
         free = slice(None) if bound else slice(2)
         errors = np.zeros(3)
         inverse = np.linalg.pinv(_curvature(deviance, best.x)[free, free])
