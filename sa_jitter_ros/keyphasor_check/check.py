@@ -43,6 +43,7 @@ from sa_jitter_ros.pulses.unit_check import find_mistakes, other_span, rate_fact
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
+from scipy import special
 
 FloatArray = NDArray[np.float64]
 
@@ -303,7 +304,7 @@ class _Check:
             log[count] = usual_marks(count) + vibration[count] + pattern
         if declared > 1:
             log[declared] += _DECLARED
-        return _normalised(log), vibration
+        return dict(zip(log, special.softmax([*log.values()]).tolist())), vibration
 
     def _at_both_rates(self, marks: Checked, numbered: NumberedPulses, found: Sequence[Marking],
                        lines: ToothLines | None, others: ToothLines | None) -> Checked:
@@ -498,10 +499,3 @@ def _without_hidden(fitted: FittedPulses, times: FloatArray, count: int
 
 def _counted(times: FloatArray, by: str) -> Checked:
     return Checked({'count': int(times.size), 'times': times.tolist()}, None, '1', (), by)
-
-
-def _normalised(log: dict[int, float]) -> dict[int, float]:
-    top = max(log.values())
-    weight = {key: math.exp(value - top) for key, value in log.items()}
-    total = sum(weight.values())
-    return {key: value / total for key, value in weight.items()}

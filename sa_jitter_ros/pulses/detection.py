@@ -42,6 +42,8 @@ Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first
 # Fraction of the level difference. After two windows with levels that agree, a smaller difference
 # is the noise of a stopped machine.
 _STOPPED = 0.1
+# Fraction of the level difference by which the levels of the same signal may have drifted.
+_DRIFTED = 0.5
 # Earlier levels that are taken up again at once.
 _TRUSTED = 3
 # Part of a window that one event may take.
@@ -244,7 +246,7 @@ class KeyphasorDetector:
                 waiting, levels = self._decide(waiting, levels)
             self._levels = levels
             return np.concatenate([self._detect(piece) for piece in waiting])
-        if _alike(levels, known):
+        if levels.resembles(known, _DRIFTED):
             self._pending = None
             if not levels.resembles(known):
                 self._levels = levels
@@ -252,7 +254,7 @@ class KeyphasorDetector:
                 self._confirmed = True
                 self._trusted.append(levels)
         elif not self._confirmed or self._idle(window, known) or any(
-                _alike(levels, item) for item in (*self._trusted, self._pending) if item):
+                levels.resembles(item, _DRIFTED) for item in (*self._trusted, self._pending) if item):
             self._levels, self._pending, self._confirmed = levels, None, False
         else:
             self._pending = levels
@@ -343,13 +345,6 @@ def _without_event(window: FloatArray, known: StateLevels) -> FloatArray:
         return window
     places = np.flatnonzero(spikes)
     return window[~spikes] if places[-1] - places[0] < _EVENT * window.size else window
-
-
-def _alike(levels: StateLevels, known: StateLevels) -> bool:
-    """Whether levels may be those of the same signal, which has drifted."""
-    return (levels.steep == known.steep
-            and abs(levels.middle - known.middle) <= 0.5 * known.difference
-            and 0.5 <= levels.difference / known.difference <= 2.0)
 
 
 def _last(pieces: list[Piece], count: int) -> list[Piece]:

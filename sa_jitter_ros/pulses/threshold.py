@@ -94,10 +94,10 @@ class StateLevels:
         """Return the size of the smaller lobe beside the resting level."""
         return min(self.high - self.resting, self.resting - self.low)
 
-    def resembles(self, known: 'StateLevels') -> bool:
-        """Return whether these levels differ so little from known ones that those are kept."""
+    def resembles(self, known: 'StateLevels', within: float = _DEAD_BAND) -> bool:
+        """Return whether the middle differs from a known one by less than a part of the size."""
         return (self.steep == known.steep
-                and abs(self.middle - known.middle) <= _DEAD_BAND * known.difference
+                and abs(self.middle - known.middle) <= within * known.difference
                 and 0.5 <= self.difference / known.difference <= 2.0)
 
     def negated(self) -> 'StateLevels':
