@@ -159,7 +159,7 @@ class PulseJudge:
             known_better = end.known >= max(_KNOWN_WELL, count)
             if known_better or 1.0 / _SAME_SCATTER < scatter / end.scatter < _SAME_SCATTER:
                 scatter, count = end.scatter, max(count, end.known)
-        self._counter.begin(first, int(lock.teeth[lock.slot]), passed=passed)
+        self._counter.begin(first, lock.tooth, passed=passed)
         model.start(math.log(lock.interval), scatter=scatter, count=count,
                     intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
         follower = PulseFollower(lock, self._queue, model, options=self._options,

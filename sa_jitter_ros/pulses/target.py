@@ -50,9 +50,8 @@ class Lock:
     """
     How the latest pulses fit a target, from pulse number `first` on, which is tooth `slot`.
 
-    For every tooth present (m,), counted from the index: `steps` to the next one in teeth, `teeth`
-    its number, and `widths`, the steps with what is known of uneven marks. Deviations of the
-    interval behind it within `believed` are expected as long as the widths are not known.
+    For every tooth present (m,), counted from the index: `steps` to the next one in teeth, and
+    `widths`, the steps with what is known of uneven marks. Deviations of the interval behind it within `believed` are expected as long as the widths are not known.
     `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`;
     `intervals` (k,) in s are those from tooth to tooth. If `unsteady`, the speed scatters.
     """
@@ -61,13 +60,17 @@ class Lock:
     slot: int
     interval: float
     steps: IntArray
-    teeth: IntArray
     widths: FloatArray
     believed: FloatArray
     scatter: float
     known: int
     intervals: FloatArray
     unsteady: bool = False
+
+    @property
+    def tooth(self) -> int:
+        """Return the number of the tooth of the first pulse."""
+        return int(self.steps[:self.slot].sum())
 
     @cached_property
     def even(self) -> bool:
@@ -154,7 +157,7 @@ class EvenTarget:
         levels = np.log(gaps / found.steps)
         ones = np.ones(self.marks, dtype=np.int64)
         return Lock(first=start + int(found.pulses[0]), slot=0, interval=float(np.exp(levels[0])),
-                    steps=ones, teeth=np.arange(self.marks), widths=ones.astype(np.float64),
+                    steps=ones, widths=ones.astype(np.float64),
                     believed=np.zeros(self.marks), scatter=found.scatter, known=levels.size,
                     intervals=gaps[found.steps == 1], unsteady=found.unsteady)
 
@@ -171,8 +174,8 @@ class ToothedWheel:
 
     >>> wheel = ToothedWheel(teeth=8, missing=1, tolerance=0.25)
     >>> lock = wheel.lock(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0]), None)
-    >>> lock.slot, lock.steps.tolist(), lock.teeth.tolist()
-    (2, [1, 1, 1, 1, 1, 1, 2], [0, 1, 2, 3, 4, 5, 6])
+    >>> lock.slot, lock.tooth, lock.steps.tolist()
+    (2, 2, [1, 1, 1, 1, 1, 1, 2])
     """
 
     def __init__(self, *, teeth: int, missing: int, tolerance: float) -> None:
@@ -220,8 +223,7 @@ class ToothedWheel:
                     slot = -index % steps.size
                     levels = np.log(intervals / np.roll(steps, -slot))
                     return Lock(first=int(single[0]), slot=slot, interval=float(guess[0]),
-                                steps=steps, teeth=np.cumsum(steps) - steps,
-                                widths=steps.astype(np.float64),
+                                steps=steps, widths=steps.astype(np.float64),
                                 believed=np.where(tolerance > self._tolerance, tolerance, 0.0),
                                 scatter=Chain(single, steps, levels).scatter,
                                 known=levels.size, intervals=intervals[np.roll(steps, -slot) == 1])
