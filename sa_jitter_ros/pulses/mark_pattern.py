@@ -183,12 +183,10 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     unlike = np.abs(slopes - (np.median(slopes[near]) if near.any() else 0.0))
     found = [(tolerance, np.flatnonzero((apart <= tolerance) & near & (
         unlike <= _UNLIKE * tolerance))) for tolerance in _REPEATING]
-    # Of few marks some repeat by chance: most of those without a stray have to.
-    often = [item for item in found if item[1].size > _CLEAN * np.count_nonzero(near)]
-    seldom = [item for item in found if item[1].size]
-    if not seldom:
+    found = [item for item in found if item[1].size]
+    if not found:
         return None
-    tolerance, fits = (often or seldom)[0]
+    tolerance, fits = found[0]
     begin = int(fits[0])
     slope = float(slopes[begin]) / count
     two = (levels[begin:begin + 2 * count].reshape(2, count)
