@@ -366,8 +366,8 @@ class _Check:
         cycles = {True: int(np.clip(turns // 8, 4, 40)), False: int(np.clip(turns // 24, 1, 20))}
         teeth = fitted.pattern.teeth
         return {correct: averages_of(
-            samples, self._rate, self._start, kept, ratio=float(ratio.value or 1.0),
-            orders=self._orders, pulses_per_revolution=teeth,
+            samples, self._rate, kept, start_time=self._start, ratio=float(ratio.value or 1.0),
+            orders=list(self._orders), pulses_per_revolution=teeth,
             missing_teeth=teeth - fitted.pattern.present, trigger_cycles=count,
             keyphasor_rate=1.0 / expected, correct_jitter=correct)
             for correct, count in cycles.items()}

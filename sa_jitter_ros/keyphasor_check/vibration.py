@@ -19,6 +19,7 @@ turns every order by the same time, a resonance does not.
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,21 +47,17 @@ class Delay:
     orders: tuple[float, ...]
 
 
-def averages_of(samples: FloatArray, rate: float, start: float, pulses: FloatArray, *,
-                ratio: float, orders: Sequence[float], pulses_per_revolution: int,
-                missing_teeth: int, trigger_cycles: int, keyphasor_rate: float,
-                correct_jitter: bool = True) -> tuple[Average, ...]:
+def averages_of(samples: FloatArray, rate: float, pulses: FloatArray, *, correct_jitter: bool,
+                **options: Any) -> tuple[Average, ...]:
     """
     Return averages of samples (channel, sample) with corrected jitter; none if it fails.
 
-    Without the correction the angle law is the spline, which follows a changing speed.
+    Without the correction the angle law is the spline, which follows a changing speed. The other
+    `options` are those of `Averager`.
     """
     try:
-        averager = Averager(
-            rate, start_time=start, ratio=ratio, orders=list(orders),
-            pulses_per_revolution=pulses_per_revolution, missing_teeth=missing_teeth,
-            trigger_cycles=trigger_cycles, correct_jitter=correct_jitter,
-            angle_law='linear' if correct_jitter else 'spline', keyphasor_rate=keyphasor_rate)
+        averager = Averager(rate, correct_jitter=correct_jitter,
+                            angle_law='linear' if correct_jitter else 'spline', **options)
         return averager.update(samples, pulses) + averager.flush()
     except SaJitterError:
         return ()

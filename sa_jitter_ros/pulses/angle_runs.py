@@ -38,7 +38,8 @@ _LEAST = 1e-3  # of a turn, likewise
 _OF_MODULUS = 1.0 / 12.0  # more is not told from a step in the other direction
 _TICK = 0.15  # of a turn, that a standing angle may move at once
 _TICKS = 3.0  # times the latest tick, likewise
-_BITS = (8, 16, 32)  # of the registers that overflow
+#: of the registers that overflow
+BITS = 8, 16, 32
 _ALIKE, _NEARLY_ALL = 0.02, 0.9  # of a count; share of the steps that are whole counts
 
 
@@ -268,7 +269,7 @@ class AngleRuns:
         jump = abs(steps.raw[i] - steps.expected[i])
         near = np.concatenate((steps.raw[max(i - _BLOCK, 1):i], steps.raw[i + 1:i + _BLOCK]))
         near = near[near != 0.0]
-        for bits in _BITS:
+        for bits in BITS:
             counts = round(2.0**bits * self._turn / jump)  # of a turn
             if counts < 2:
                 continue

@@ -254,7 +254,8 @@ class KeyphasorDetector:
                 self._confirmed = True
                 self._trusted.append(levels)
         elif not self._confirmed or self._idle(window, known) or any(
-                levels.resembles(item, _DRIFTED) for item in (*self._trusted, self._pending) if item):
+                levels.resembles(item, _DRIFTED)
+                for item in (*self._trusted, self._pending) if item):
             self._levels, self._pending, self._confirmed = levels, None, False
         else:
             self._pending = levels

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number
-from sa_jitter_ros.pulses.angle_runs import AngleRuns
+from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
 
 FloatArray = NDArray[np.float64]
 
@@ -40,12 +40,11 @@ _STEPS = 512  # steps of the angle, from which its resolution follows
 _MULTIPLE, _MOST = 0.02, 0.9  # of a step; share of the steps that are multiples of the resolution
 _MEMORY = 0.98  # weight of the errors before, at each crossing
 _DITHER = 1.5  # counts; less back is no reversal of a counter
-_REGISTERS = (2.0**8, 2.0**16, 2.0**32)  # ranges of counters
 _MOST_BEFORE = 1 << 14  # samples before the shaft turns
 _MOST_AT_ONCE = 50_000_000  # pulses
 _LEAST_MODULUS = 4.0  # counts; with fewer the direction cannot be told
 _USUALLY = 0.9  # of the counts are within the range of a counter
-_EXACT = 2.0**53  # the largest count that is exact
+_EXACT = 2.0 / np.finfo(np.float64).eps  # the largest count that is exact
 
 
 @dataclass(frozen=True)
@@ -339,7 +338,7 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
     size = np.quantile(np.abs(counts), _USUALLY)
     low, high = np.quantile(counts, (1.0 - _USUALLY, _USUALLY))
     below = (0.0,) if low >= 0.0 else (1.0,) if high <= 0.0 else (0.0, 0.5, 1.0)
-    registers = [each for each in (turn, *_REGISTERS) if each >= max(size, _LEAST_MODULUS)]
+    registers = [each for each in (turn, *(2.0**bits for bits in BITS)) if each >= max(size, _LEAST_MODULUS)]
     steps = np.diff(counts)
     falls = np.flatnonzero(np.abs(steps) > 0.5 * (np.ptp(counts) + 1.0))
     usual = 2.0 * float(np.median(np.abs(steps))) + 2.0 if steps.size else 0.0

@@ -51,8 +51,9 @@ class Lock:
     How the latest pulses fit a target, from pulse number `first` on, which is tooth `slot`.
 
     For every tooth present (m,), counted from the index: `steps` to the next one in teeth, and
-    `widths`, the steps with what is known of uneven marks. Deviations of the interval behind it within `believed` are expected as long as the widths are not known.
-    `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`;
+    `widths`, the steps with what is known of uneven marks. Deviations of the interval behind it
+    within `believed` are expected as long as the widths are not known. `interval` (s) is the first
+    time from tooth to tooth; `known` intervals had the `scatter`;
     `intervals` (k,) in s are those from tooth to tooth. If `unsteady`, the speed scatters.
     """
 

@@ -127,16 +127,14 @@ class TriggerCounter:
             self._count()
         self._numbering = numbering
 
-    def flush(self) -> TriggerPulses:
-        """Return the last trigger pulses: none waits here."""
-        return self.take()
-
     def take(self) -> TriggerPulses:
         """Return the new trigger pulses."""
         if self.running:
             self._count()
         found, self._found = self._found, []
         return TriggerPulses.joined(found)
+
+    flush = take  # none waits here
 
     def _count(self) -> None:
         numbers = np.array(self._steps).cumsum()
