@@ -178,9 +178,6 @@ class MarkCorrector:
                 self._wanted = float(min(item for item in _TRIED if item > self._wanted))
                 return
         elif self._waits or self.geometry is None:
-            if found is None and not self._waits:
-                self._wanted *= 2.0
-                return
             if self._learns:
                 self._use(found, teeth)
         elif found is not None:

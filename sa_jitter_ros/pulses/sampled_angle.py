@@ -338,7 +338,8 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
     size = np.quantile(np.abs(counts), _USUALLY)
     low, high = np.quantile(counts, (1.0 - _USUALLY, _USUALLY))
     below = (0.0,) if low >= 0.0 else (1.0,) if high <= 0.0 else (0.0, 0.5, 1.0)
-    registers = [each for each in (turn, *(2.0**bits for bits in BITS)) if each >= max(size, _LEAST_MODULUS)]
+    registers = [each for each in (turn, *(2.0**bits for bits in BITS))
+                 if each >= max(size, _LEAST_MODULUS)]
     steps = np.diff(counts)
     falls = np.flatnonzero(np.abs(steps) > 0.5 * (np.ptp(counts) + 1.0))
     usual = 2.0 * float(np.median(np.abs(steps))) + 2.0 if steps.size else 0.0
