@@ -127,9 +127,7 @@ class EvenTarget:
         if pulses.size < _FEWEST:
             return _FEWEST
         interval = float(np.median(np.diff(pulses[:_FEWEST])))
-        first = _FEWEST
-        if not known and interval * _FEWEST < _LEARNING_TIME:
-            first = int(_LEARNING_TIME / interval) if interval * _MOST > _LEARNING_TIME else _MOST
+        first = _FEWEST if known else int(np.clip(_LEARNING_TIME / interval, _FEWEST, _MOST))
         more = 2 << min(failed // 2, _DOUBLED)
         return first + min(more - 2, _MORE) if tried < first else tried + more
 
