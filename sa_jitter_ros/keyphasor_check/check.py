@@ -163,7 +163,7 @@ class _Check:
             'spurious': _counted(fitted.strays, hidden or 'pulses that stand beside every mark'),
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
-            'path_delay': self._delay(averages.get(False, ()), ratio)}
+            'path_delay': path_delay(averages.get(False, ()), float(ratio.value or 1.0))}
         concerned = self._orders or NO_ORDERS
         from_marks = by_marks(fitted, float(ratio.value or 1.0), concerned)
         warnings = (*self._warnings, *contradictions(per_revolution, self._machine),
@@ -464,15 +464,6 @@ class _Check:
         total = sum(value for _, value in others)
         return [(1.0, 1.0 - _ANOTHER), *((ratio, _ANOTHER * value / total)
                                          for ratio, value in others)]
-
-    def _delay(self, averages: Sequence[Average], ratio: Checked) -> Checked:
-        if not averages:
-            return Checked(None, None, 's', (), 'no averages of the vibration')
-        delay, why = path_delay(averages, float(ratio.value or 1.0))
-        if delay is None:
-            return Checked(None, None, 's', (), why)
-        return Checked(delay.delay, delay.standard_error, 's', (),
-                       'phases of the orders turn alike with the speed')
 
 
 def _require_wheel(fitted: FittedPulses, numbered: NumberedPulses) -> None:
