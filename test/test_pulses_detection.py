@@ -385,8 +385,8 @@ def test_spikes_in_every_window_cost_no_pulse(speed, every, length, rng):
     clean = 5.0 * ((speed * time) % 1.0 < 0.2) + rng.normal(0.0, 0.05, time.size)
     spoilt = clean.copy()
     places = np.rint(np.arange(0.113, 3.9, every) * 5e3).astype(int)
-    for place in places:
-        spoilt[place:place + length] = 60.0
+    for number, place in enumerate(places):
+        spoilt[place:place + length] = (60.0, 200.0, -90.0)[number % 3]
     detector = KeyphasorDetector()
     found = np.append(detector.update(spoilt, 0.0, 5e3), detector.flush())
     assert np.abs(found - sa.detect_pulses(clean, 5e3)).max() < 2e-4
