@@ -73,6 +73,8 @@ class MarkCorrector:
         self._shift = 0  # teeth from mark 0 to number 0 of the present runs
         self._calls: list[Callable[[], None]] = []  # of the counter, which wait
         self._known_end = self._running = self._begun = self._dropped = False
+        self._new_times: list[float] = []
+        self._new_steps: list[int] = []
         self._passed: int | None = None  # teeth from the run before to the first pulse
         self._times, self._numbers = np.empty(0), np.empty(0, np.int64)  # the latest of the run
         self._measure_from_here()
@@ -95,16 +97,19 @@ class MarkCorrector:
 
     def extend(self, times: list[float], steps: list[int]) -> None:
         """Add pulses (s) to the run, each `steps` teeth after the one before."""
-        self._take(np.array(times), self._numbers[-1] + np.cumsum(steps, dtype=np.int64))
+        self._new_times += times
+        self._new_steps += steps
 
     def drop(self) -> None:
         """Record that a pulse behind the latest one was dropped."""
+        self._measure()
         self._dropped |= not self._begun
         if self._begun:
             self._calls.append(self._counter.drop)
 
     def stop(self, *, known: bool = True) -> None:
         """End the run; `known`: the last pulse is valid."""
+        self._measure()
         if self._running or not known:
             if self._running and not self._begun:
                 self._begin(self._times, self._numbers)
@@ -118,10 +123,12 @@ class MarkCorrector:
 
     def take(self) -> TriggerPulses:
         """Return the new trigger pulses."""
+        self._measure()
         return self._counter.take()
 
     def flush(self) -> TriggerPulses:
         """Return the trigger pulses that waited, because none follows."""
+        self._measure()
         self._wait_no_longer()
         return self._counter.take()
 
@@ -134,6 +141,13 @@ class MarkCorrector:
         self._wanted = float(_RENEWED)
         if self._waits:
             self._wanted = float(_LEARNT if self._known is None else _TRIED[0])
+
+    def _measure(self) -> None:
+        """Measure the new pulses of the run."""
+        if self._new_times:
+            times, steps = np.array(self._new_times), np.array(self._new_steps, np.int64)
+            self._new_times, self._new_steps = [], []
+            self._take(times, self._numbers[-1] + np.cumsum(steps))
 
     def _take(self, times: FloatArray, numbers: IntArray) -> None:
         """Measure the next pulses (n,) of the run, and pass on what need not wait."""
