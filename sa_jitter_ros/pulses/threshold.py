@@ -197,7 +197,7 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
     kept, spikes, longest = samples, 0, 0
     for _ in range(_SIZES):
         low, high = (float(kept.min()), float(kept.max())) if kept.size else (0.0, 0.0)
-        if not low < high:
+        if high - low <= 10 * _BINS * np.spacing(max(abs(low), abs(high))):  # one level is left
             break
         outside = kept > 0.5 * (low + high)
         if 2 * np.count_nonzero(outside) > kept.size:
