@@ -37,7 +37,8 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import MessageError, SignalError
 from sa_jitter_ros.nodes.messages import decode_average, decode_pulse_reference, encode_average
-from sa_jitter_ros.pulses.detector_parameters import detector_of, DETECTOR_PARAMETERS
+from sa_jitter_ros.pulses.detection import detector_of
+from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.recordings.message_layouts import FLOAT64, SampleDecoder
 
 FloatArray = NDArray[np.float64]

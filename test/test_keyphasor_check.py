@@ -17,6 +17,7 @@ from sa_jitter_ros.errors import RecordingError, SignalError
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.clock import find_clock
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
+from sa_jitter_ros.keyphasor_check.lines import marks_evidence, ToothLines
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
@@ -435,3 +436,11 @@ def test_a_speed_that_scatters_from_mark_to_mark_is_no_fault_of_the_keyphasor(sh
         assert 'the speed scatters so much' in found.findings[name].decided_by
     assert found.findings['jitter_std'].value is None
     assert not {'missing', 'spurious', 'jitter'} & {item.code for item in found.warnings}
+
+
+def test_a_vibration_may_repeat_several_times_in_a_revolution():
+    size = np.linspace(20.0, 40.0, 4)
+    lines = ToothLines(np.array([2.0, 3.0, 5.0, 7.0]), size, size / 40.0, 1e-3)
+    one, two, four = marks_evidence(lines, [1, 2, 4]).values()
+    assert 1.0 < one - two < 2.5  # not the four lines that would be at odd orders by chance
+    assert 1.5 < one - four < 3.5

@@ -96,7 +96,8 @@ def test_an_order_that_one_average_refuses_gives_no_delay_and_no_warning():
         warnings.simplefilter('error')
         for refused in ((False, True), (True, True)):
             items = [item(20.0 + k, refused[k % 2]) for k in range(8)]
-            assert path_delay(items, 1.0) == (
+            found = path_delay(items, 1.0)
+            assert (found.value, found.decided_by) == (
                 None, 'fewer than two orders stand clear of their noise at all speeds')
 
 

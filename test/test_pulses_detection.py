@@ -376,3 +376,18 @@ def test_spikes_of_a_recording_are_told():
     wave[1234] = 80.0
     with pytest.warns(sa.DataWarning, match='1 sample of the keyphasor waveform is a spike'):
         assert sa.detect_pulses(wave, 2000.0).size == 50
+
+
+@pytest.mark.parametrize(('speed', 'every', 'length'), [
+    (20.0, 0.45, 3), (20.0, 0.3, 1), (200.0, 0.06, 1)])
+def test_spikes_in_every_window_cost_no_pulse(speed, every, length, rng):
+    time = np.arange(20_000) / 5e3
+    clean = 5.0 * ((speed * time) % 1.0 < 0.2) + rng.normal(0.0, 0.05, time.size)
+    spoilt = clean.copy()
+    places = np.rint(np.arange(0.113, 3.9, every) * 5e3).astype(int)
+    for number, place in enumerate(places):
+        spoilt[place:place + length] = (60.0, 200.0, -90.0)[number % 3]
+    detector = KeyphasorDetector()
+    found = np.append(detector.update(spoilt, 0.0, 5e3), detector.flush())
+    assert np.abs(found - sa.detect_pulses(clean, 5e3)).max() < 2e-4
+    assert detector.state.spikes == length * places.size

@@ -605,3 +605,14 @@ def test_an_expected_interval_that_ran_away_stops_nothing():
     pulses = np.cumsum(1.0 + 0.02 * np.sin(np.arange(600) / 50)) + jitter * rng.normal(size=600)
     validate(pulses[rng.random(600) > 0.5] / 100.0, pulses_per_revolution=4,
              pulses_per_trigger=1)
+
+
+@pytest.mark.parametrize('marks', [1, 4])
+def test_marks_keep_their_numbers_across_a_long_gap(rng, marks):
+    pulses = 0.01 * np.arange(400.0) + rng.normal(0.0, 1e-6, 400)
+    validator = PulseValidator(pulses_per_revolution=marks)
+    given = np.delete(pulses, np.arange(202, 211))  # more than `maximum_missing`
+    found = TriggerPulses.joined([validator.update(given), validator.flush()])
+    numbers = np.rint(found.times / 0.01).astype(int)
+    assert np.all(numbers == marks * found.count)
+    assert numbers[-1] + marks >= 400 > found.times.size * marks > 380

@@ -43,6 +43,7 @@ from sa_jitter_ros.pulses.unit_check import find_mistakes, other_span, rate_fact
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
+from scipy import special
 
 FloatArray = NDArray[np.float64]
 
@@ -162,7 +163,7 @@ class _Check:
             'spurious': _counted(fitted.strays, hidden or 'pulses that stand beside every mark'),
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
-            'path_delay': self._delay(averages.get(False, ()), ratio)}
+            'path_delay': path_delay(averages.get(False, ()), float(ratio.value or 1.0))}
         concerned = self._orders or NO_ORDERS
         from_marks = by_marks(fitted, float(ratio.value or 1.0), concerned)
         warnings = (*self._warnings, *contradictions(per_revolution, self._machine),
@@ -303,7 +304,7 @@ class _Check:
             log[count] = usual_marks(count) + vibration[count] + pattern
         if declared > 1:
             log[declared] += _DECLARED
-        return _normalised(log), vibration
+        return dict(zip(log, special.softmax([*log.values()]).tolist())), vibration
 
     def _at_both_rates(self, marks: Checked, numbered: NumberedPulses, found: Sequence[Marking],
                        lines: ToothLines | None, others: ToothLines | None) -> Checked:
@@ -365,8 +366,8 @@ class _Check:
         cycles = {True: int(np.clip(turns // 8, 4, 40)), False: int(np.clip(turns // 24, 1, 20))}
         teeth = fitted.pattern.teeth
         return {correct: averages_of(
-            samples, self._rate, self._start, kept, ratio=float(ratio.value or 1.0),
-            orders=self._orders, pulses_per_revolution=teeth,
+            samples, self._rate, kept, start_time=self._start, ratio=float(ratio.value or 1.0),
+            orders=list(self._orders), pulses_per_revolution=teeth,
             missing_teeth=teeth - fitted.pattern.present, trigger_cycles=count,
             keyphasor_rate=1.0 / expected, correct_jitter=correct)
             for correct, count in cycles.items()}
@@ -464,15 +465,6 @@ class _Check:
         return [(1.0, 1.0 - _ANOTHER), *((ratio, _ANOTHER * value / total)
                                          for ratio, value in others)]
 
-    def _delay(self, averages: Sequence[Average], ratio: Checked) -> Checked:
-        if not averages:
-            return Checked(None, None, 's', (), 'no averages of the vibration')
-        delay, why = path_delay(averages, float(ratio.value or 1.0))
-        if delay is None:
-            return Checked(None, None, 's', (), why)
-        return Checked(delay.delay, delay.standard_error, 's', (),
-                       'phases of the orders turn alike with the speed')
-
 
 def _require_wheel(fitted: FittedPulses, numbered: NumberedPulses) -> None:
     """Raise SignalError for pulses that come at random."""
@@ -498,10 +490,3 @@ def _without_hidden(fitted: FittedPulses, times: FloatArray, count: int
 
 def _counted(times: FloatArray, by: str) -> Checked:
     return Checked({'count': int(times.size), 'times': times.tolist()}, None, '1', (), by)
-
-
-def _normalised(log: dict[int, float]) -> dict[int, float]:
-    top = max(log.values())
-    weight = {key: math.exp(value - top) for key, value in log.items()}
-    total = sum(weight.values())
-    return {key: value / total for key, value in weight.items()}

@@ -73,12 +73,12 @@ def _of_pulses(fitted: FittedPulses, orders: Sequence[float]) -> list[Warn]:
             'spurious', f'{strays} of {total + strays} pulses belong to no mark: raise hysteresis '
             'or threshold, and shield the sensor; each takes a revolution from the average where '
             f'the validation cannot tell it from the true pulse{many}',
-            _same(orders, 100.0 * min(strays / turns, 1.0))))
+            _percent(orders, [min(strays / turns, 1.0)] * len(orders))))
     if lost:
         found.append(Warn(
             'missing', f'{lost} marks have no pulse: lower the hysteresis or the distance of the '
             'sensor, and set maximum_discarded, so that only the revolutions without a pulse are '
-            'lost', _same(orders, 100.0 * min(lost / turns, 1.0))))
+            'lost', _percent(orders, [min(lost / turns, 1.0)] * len(orders))))
     return found
 
 
@@ -207,10 +207,6 @@ def _of_changes(times: FloatArray) -> list[Warn]:
         f'{times[half]:.6g} s, '
         f'and like {names[1]} behind it: check whether two recordings were joined, or a mark came '
         'off')]
-
-
-def _same(orders: Sequence[float], percent: float) -> tuple[tuple[float, float], ...]:
-    return tuple((g, percent) for g in orders)
 
 
 def _percent(orders: Sequence[float], loss: Sequence[float]) -> tuple[tuple[float, float], ...]:

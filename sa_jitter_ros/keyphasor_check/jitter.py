@@ -29,7 +29,6 @@ _FEWEST = 24
 _LOWEST = 0.02  # cycles a pulse, below which the motion has any spectrum
 _MOST = 65_536
 _BINS = 300
-_STARTS = (0.0, 0.4, -0.4)  # in parts of the bound
 _INFLATION = 1.5  # neighbouring lines of a Hann window are correlated
 _BOUND = 1.5  # of the inverse hyperbolic tangent of the correlation
 _LEAST = 0.02  # of the scatter of the pulses beside their neighbours: less is no jitter found
@@ -78,7 +77,7 @@ def measure_jitter(true: FloatArray, numbers: NDArray[np.int64]) -> Jitter | Non
     omega, power = 2.0 * np.pi * frequency[use], power[use]
     transfer = (2.0 - 2.0 * np.cos(omega)) ** 2
     scale = float(np.median(power / transfer)) or 1e-30
-    omega, transfer, power, count = _binned(omega, transfer, power)
+    (omega, transfer, power), count = _binned(np.stack((omega, transfer, power)))
 
     def spectrum(parameters: FloatArray) -> FloatArray:
         size, motion, memory = np.exp(parameters[0]), np.exp(parameters[1]), parameters[2]
@@ -93,10 +92,9 @@ def measure_jitter(true: FloatArray, numbers: NDArray[np.int64]) -> Jitter | Non
     from scipy import optimize  # which loads long, for programs that fit nothing
 
     def fitted(bound: float) -> tuple[FloatArray, FloatArray]:
-        best = min((optimize.minimize(
-            deviance, np.array([0.0, -6.0, start * bound]), method='L-BFGS-B',
-            bounds=((-25.0, 15.0), (-35.0, 10.0), (-bound, bound))) for start in _STARTS),
-            key=lambda item: float(item.fun))
+        best = optimize.minimize(
+            deviance, np.array([0.0, -6.0, 0.0]), method='L-BFGS-B',
+            bounds=((-25.0, 15.0), (-35.0, 10.0), (-bound, bound)))
         free = slice(None) if bound else slice(2)
         errors = np.zeros(3)
         inverse = np.linalg.pinv(_curvature(deviance, best.x)[free, free])
@@ -116,14 +114,12 @@ def measure_jitter(true: FloatArray, numbers: NDArray[np.int64]) -> Jitter | Non
                   (1.0 - correlation**2) * float(errors[2]) if known else math.nan)
 
 
-def _binned(omega: FloatArray, transfer: FloatArray, power: FloatArray
-            ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return means over neighbouring lines, and how many lines each is."""
-    step = max(1, omega.size // _BINS)
-    starts = np.arange(0, omega.size, step)
-    count = np.diff(np.append(starts, omega.size)).astype(np.float64)
-    return (np.add.reduceat(omega, starts) / count, np.add.reduceat(transfer, starts) / count,
-            np.add.reduceat(power, starts) / count, count)
+def _binned(spectra: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return means (row, bin) of rows over neighbouring lines, and how many lines each is."""
+    lines = spectra.shape[1]
+    starts = np.arange(0, lines, max(1, lines // _BINS))
+    count = np.diff(np.append(starts, lines)).astype(np.float64)
+    return np.add.reduceat(spectra, starts, axis=1) / count, count
 
 
 def _curvature(call: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:

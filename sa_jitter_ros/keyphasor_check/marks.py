@@ -104,16 +104,12 @@ class FittedPulses:
     @property
     def mean_speed(self) -> float:
         """Return the mean speed of the tach shaft in Hz, without standstills."""
-        turned, time = np.diff(self.revolutions), np.diff(self.true)
-        moving = np.ones(time.size, np.bool_)
-        moving[self.breaks - 1] = False
-        return float(turned[moving].sum() / time[moving].sum())
+        return self.turns / float(np.delete(np.diff(self.true), self.breaks - 1).sum())
 
     @property
     def turns(self) -> float:
         """Return the number of revolutions, without standstills."""
-        turned = np.diff(self.revolutions)
-        return float(turned.sum() - turned[self.breaks - 1].sum())
+        return float(np.delete(np.diff(self.revolutions), self.breaks - 1).sum())
 
     @property
     def speed(self) -> FloatArray:

@@ -17,8 +17,8 @@ turns every order by the same time, a resonance does not.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import Jitter
+from sa_jitter_ros.keyphasor_check.result import Checked
 from scipy import special
 
 FloatArray = NDArray[np.float64]
@@ -37,30 +38,17 @@ _AGREE = 0.01  # p value below which orders disagree
 _CLEAR = 5.0  # amplitude over its noise
 
 
-@dataclass(frozen=True)
-class Delay:
-    """Delay of the tach in s behind the vibration, its standard error, the orders that agree."""
-
-    delay: float
-    standard_error: float
-    orders: tuple[float, ...]
-
-
-def averages_of(samples: FloatArray, rate: float, start: float, pulses: FloatArray, *,
-                ratio: float, orders: Sequence[float], pulses_per_revolution: int,
-                missing_teeth: int, trigger_cycles: int, keyphasor_rate: float,
-                correct_jitter: bool = True) -> tuple[Average, ...]:
+def averages_of(samples: FloatArray, rate: float, pulses: FloatArray, *, correct_jitter: bool,
+                **options: Any) -> tuple[Average, ...]:
     """
     Return averages of samples (channel, sample) with corrected jitter; none if it fails.
 
-    Without the correction the angle law is the spline, which follows a changing speed.
+    Without the correction the angle law is the spline, which follows a changing speed. The other
+    `options` are those of `Averager`.
     """
     try:
-        averager = Averager(
-            rate, start_time=start, ratio=ratio, orders=list(orders),
-            pulses_per_revolution=pulses_per_revolution, missing_teeth=missing_teeth,
-            trigger_cycles=trigger_cycles, correct_jitter=correct_jitter,
-            angle_law='linear' if correct_jitter else 'spline', keyphasor_rate=keyphasor_rate)
+        averager = Averager(rate, correct_jitter=correct_jitter,
+                            angle_law='linear' if correct_jitter else 'spline', **options)
         return averager.update(samples, pulses) + averager.flush()
     except SaJitterError:
         return ()
@@ -92,17 +80,19 @@ def recovered_jitter(averages: Sequence[Average]) -> Jitter | None:
                   1.0 / math.sqrt(count))
 
 
-def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None, str]:
+def path_delay(averages: Sequence[Average], ratio: float) -> Checked:
     """
-    Return the delay of the tach from the phases of orders, and why there is none.
+    Return the delay (s) of the tach behind the vibration, from the phases of orders.
 
     The phase of order g of a shaft that turns at frequency f advances by 2 pi g f times the delay.
     """
+    if not averages:
+        return _unknown('no averages of the vibration')
     if len(averages) < _FEWEST_SPEEDS:
-        return None, 'too few averages of the vibration: record longer'
+        return _unknown('too few averages of the vibration: record longer')
     speeds = np.array([item.trigger_speed for item in averages])
     if np.ptp(speeds) < _SPEED_RANGE * speeds.mean():
-        return None, 'the speed hardly changes: record a run-up or several speeds'
+        return _unknown('the speed hardly changes: record a run-up or several speeds')
     amplitudes = np.array([item.amplitudes for item in averages])
     noise = np.array([item.noise for item in averages])
     size = np.abs(amplitudes)
@@ -110,7 +100,7 @@ def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None,
     clear = np.nan_to_num(np.divide(
         size, noise, out=np.where(size > 0.0, np.inf, 0.0), where=noise != 0.0),
         posinf=np.inf).min(axis=0)
-    found, errors, orders, turned = [], [], [], []
+    found, errors, turned = [], [], []
     centred = speeds - speeds.mean()
     for place, order in enumerate(averages[0].orders):
         channel = int(np.argmax(clear[:, place]))
@@ -122,18 +112,21 @@ def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None,
         if np.abs(left).max() < 0.25 / (order * ratio):
             found.append(slope)
             errors.append(max(error, 1e-15))
-            orders.append(float(order))
             turned.append(angle)
     if len(found) < 2:
-        return None, 'fewer than two orders stand clear of their noise at all speeds'
+        return _unknown('fewer than two orders stand clear of their noise at all speeds')
     weight = 1.0 / np.array(errors) ** 2
     # Pulse errors turn all orders at once: the orders are not independent of each other.
     mean, error, _ = _slope(centred, weight @ np.array(turned) / weight.sum())
     chi2 = float(((np.array(found) - mean) ** 2) @ weight)
     if special.chdtrc(len(found) - 1, chi2) < _AGREE:
-        return None, ('the orders turn differently with the speed, as resonances make them: tap '
-                      'the sensor, or compare with a second tach at the vibration input')
-    return Delay(mean, error, tuple(orders)), ''
+        return _unknown('the orders turn differently with the speed, as resonances make them: tap '
+                        'the sensor, or compare with a second tach at the vibration input')
+    return Checked(mean, error, 's', (), 'phases of the orders turn alike with the speed')
+
+
+def _unknown(why: str) -> Checked:
+    return Checked(None, None, 's', (), why)
 
 
 def _slope(centred: FloatArray, values: FloatArray) -> tuple[float, float, FloatArray]:

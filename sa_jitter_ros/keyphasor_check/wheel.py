@@ -117,9 +117,7 @@ def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Mar
     part = _longest(pulses)
     numbers, places = pulses.numbers[part], pulses.places[part]
     classes = numbers % teeth
-    span = np.bincount(np.arange(numbers[0], numbers[-1] + 1) % teeth, minlength=teeth)
-    seen = np.bincount(classes, minlength=teeth)
-    missing = _missing(seen, span)
+    missing = _missing(*_seen_of(numbers, teeth))
     origin = _index(missing)
     missing = np.roll(missing, -origin)
     late = np.array([np.median(places[classes == (tooth + origin) % teeth])
@@ -144,6 +142,14 @@ def _index(missing: BoolArray) -> int:
     return int(there[index_of(np.diff(np.append(there, there[0] + missing.size)))])
 
 
+def _seen_of(numbers: IntArray, teeth: int) -> tuple[IntArray, IntArray]:
+    """Return the pulses of each tooth of a target (teeth,), and the revolutions that it made."""
+    turns, rest = divmod(int(numbers[-1] - numbers[0]) + 1, teeth)
+    span = np.full(teeth, turns)
+    span[(numbers[0] + np.arange(rest)) % teeth] += 1
+    return np.bincount(numbers % teeth, minlength=teeth), span
+
+
 def _missing(seen: IntArray, span: IntArray) -> BoolArray:
     share = seen / np.maximum(span, 1)
     usual = float(np.quantile(share, 0.75))
@@ -156,11 +162,8 @@ def _missing(seen: IntArray, span: IntArray) -> BoolArray:
 def _evidence(numbers: IntArray, places: FloatArray, teeth: int) -> float:
     """Return the log likelihood of a target of so many teeth, less half a log n a parameter."""
     classes = numbers % teeth
-    seen = np.bincount(classes, minlength=teeth).astype(np.float64)
-    total = int(numbers[-1] - numbers[0]) + 1
-    span = np.full(teeth, total // teeth, np.float64)
-    span[(numbers[0] + np.arange(total % teeth)) % teeth] += 1.0
-    missing = _missing(np.asarray(seen, np.int64), np.asarray(span, np.int64))
+    seen, span = _seen_of(numbers, teeth)
+    missing = _missing(seen, span)
     lost = float((span - seen)[~missing].sum())
     positions = float(span[~missing].sum())
     share = min(max(lost / positions, 0.5 / positions), 0.5)

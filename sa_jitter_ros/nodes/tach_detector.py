@@ -27,7 +27,8 @@ from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES
 from sa_jitter_ros.nodes.signals import PulseOutput, SampleInput
 from sa_jitter_ros.parameters import (
     Parameter, PULSES_PER_REVOLUTION, sample_parameters, TACH_TYPE, Values)
-from sa_jitter_ros.pulses.detector_parameters import DECISIVE, detector_of, DETECTOR_PARAMETERS
+from sa_jitter_ros.pulses.detection import detector_of
+from sa_jitter_ros.pulses.detector_parameters import DECISIVE, DETECTOR_PARAMETERS
 from sensor_msgs.msg import JointState
 
 FloatArray = NDArray[np.float64]

@@ -33,8 +33,7 @@ from sa_jitter_ros.offline.files import (
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
-from sa_jitter_ros.pulses.detection import spikes_text
-from sa_jitter_ros.pulses.detector_parameters import detector_of
+from sa_jitter_ros.pulses.detection import detector_of, spikes_text
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import (

@@ -27,7 +27,8 @@ from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
     converted, HARDWARE_ID, Parameter, require_shaft_names, unknown_names, Values)
-from sa_jitter_ros.pulses.detector_parameters import detector_of, DETECTOR_PARAMETERS
+from sa_jitter_ros.pulses.detection import detector_of
+from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
 

@@ -15,7 +15,6 @@ What the shaft turns from one sample to the next is learnt from the samples befo
 does not fit is a wrap, a glitch of few samples, another speed, or the begin of a new run.
 """
 
-from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
@@ -39,7 +38,8 @@ _LEAST = 1e-3  # of a turn, likewise
 _OF_MODULUS = 1.0 / 12.0  # more is not told from a step in the other direction
 _TICK = 0.15  # of a turn, that a standing angle may move at once
 _TICKS = 3.0  # times the latest tick, likewise
-_BITS = (8, 16, 32)  # of the registers that overflow
+#: of the registers that overflow
+BITS = 8, 16, 32
 _ALIKE, _NEARLY_ALL = 0.02, 0.9  # of a count; share of the steps that are whole counts
 
 
@@ -49,15 +49,6 @@ class Piece(NamedTuple):
     begins: bool
     time: FloatArray
     angle: FloatArray
-
-
-@dataclass(frozen=True)
-class _Usual:
-    """Step a sample, how far others may be from it, and interval of the samples (s)."""
-
-    step: float
-    tolerance: float
-    interval: float
 
 
 class AngleRuns:
@@ -97,7 +88,8 @@ class AngleRuns:
         # From two whole blocks before those that are not decided on.
         self._time, self._value = self._time[kept:], self._value[kept:]
         self._decided = 0  # of them
-        self._blocks: list[_Usual] = []  # of the whole blocks of them
+        # Step a sample, how far others may be from it, and interval (s) of whole blocks of them.
+        self._blocks = np.empty((0, 3))
         self._angle = math.nan  # of the latest sample that is decided
 
     def update(self, time: FloatArray, value: FloatArray, *, ends: bool = False) -> list[Piece]:
@@ -147,7 +139,7 @@ class AngleRuns:
                              for each in (self._value, self._time))
             interval = np.median(length, axis=1)
             usual = self._usual(table, np.maximum(length / interval[:, None], 1.0))
-            self._blocks += [_Usual(*map(float, each)) for each in zip(*usual, interval)]
+            self._blocks = np.vstack((self._blocks, np.transpose((*usual, interval))))
 
     # --- what is decided ---
 
@@ -277,7 +269,7 @@ class AngleRuns:
         jump = abs(steps.raw[i] - steps.expected[i])
         near = np.concatenate((steps.raw[max(i - _BLOCK, 1):i], steps.raw[i + 1:i + _BLOCK]))
         near = near[near != 0.0]
-        for bits in _BITS:
+        for bits in BITS:
             counts = round(2.0**bits * self._turn / jump)  # of a turn
             if counts < 2:
                 continue
@@ -307,30 +299,22 @@ class AngleRuns:
 class _Steps:
     """The steps of a block of samples and what is decided on them; the first is none."""
 
-    def __init__(self, time: FloatArray, value: FloatArray, blocks: list[_Usual]) -> None:
+    def __init__(self, time: FloatArray, value: FloatArray, blocks: FloatArray) -> None:
         count = value.size
-        self.raw = _differences(value)
+        self.raw = np.diff(value, prepend=value[:1])
         self.taken = self.raw.copy()  # without wraps
         self.kept, self.begins = np.ones(count, bool), np.zeros(count, bool)
         self.span, self.gap = np.ones(count), np.zeros(count, bool)
         self.expected, self.limit = np.zeros(count), np.full(count, np.inf)
-        if not blocks:
+        if not len(blocks):
             return
         # Those of a block are judged by the block before, those of the first one by itself.
         place = np.minimum(np.maximum((np.arange(count) - 1) // _BLOCK - 1, 0), len(blocks) - 1)
-        step, limit, interval = np.array(
-            [(each.step, each.tolerance, each.interval) for each in blocks])[place].T
-        intervals = _differences(time)
+        step, limit, interval = blocks[place].T
+        intervals = np.diff(time, prepend=time[:1])
         self.gap = intervals > _GAP * interval
         self.span = np.maximum(intervals / interval, 1.0)
         self.expected, self.limit = step * self.span, limit * self.span
-
-
-def _differences(values: FloatArray) -> FloatArray:
-    """Return the differences to the element before, 0 for the first one."""
-    result = np.zeros_like(values)
-    np.subtract(values[1:], values[:-1], out=result[1:])
-    return result
 
 
 def _centre(values: FloatArray) -> tuple[FloatArray, FloatArray]:

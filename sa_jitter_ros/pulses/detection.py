@@ -25,13 +25,14 @@ import warnings
 
 import numpy as np
 import numpy.typing as npt
-from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
-from sa_jitter_ros.parameters import number
+from sa_jitter_ros.errors import DataWarning, SignalError
+from sa_jitter_ros.parameters import number, Values
+from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS, OPTIONS
 from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
 from sa_jitter_ros.samples import SampleBlock
 
-__all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'pulses_in_blocks',
-           'spikes_text']
+__all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'detector_of',
+           'pulses_in_blocks', 'spikes_text']
 
 FloatArray = npt.NDArray[np.float64]
 Polarity = Literal['positive', 'negative', 'auto']
@@ -41,6 +42,8 @@ Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first
 # Fraction of the level difference. After two windows with levels that agree, a smaller difference
 # is the noise of a stopped machine.
 _STOPPED = 0.1
+# Fraction of the level difference by which the levels of the same signal may have drifted.
+_DRIFTED = 0.5
 # Earlier levels that are taken up again at once.
 _TRUSTED = 3
 # Part of a window that one event may take.
@@ -115,21 +118,11 @@ class KeyphasorDetector:
         edge: Edge = 'rising', interpolate: bool = True,
         minimum_interval: float = 0.0, learning_time: float = 0.5, minimum_difference: float = 0.0,
     ) -> None:
-        if threshold is not None and not np.isfinite(threshold):
-            raise ParameterError(f'threshold {threshold} is not finite: give a level, or None')
-        if not 0.0 <= hysteresis < 1.0:
-            raise ParameterError(f'hysteresis {hysteresis} is outside 0 <= hysteresis < 1: '
-                                 'give a fraction of the difference of the state levels')
-        if polarity not in ('positive', 'negative', 'auto'):
-            raise ParameterError(f"polarity '{polarity}': use 'positive', 'negative' or 'auto'")
-        if edge not in ('rising', 'falling', 'centre'):
-            raise ParameterError(f"edge '{edge}': use 'rising', 'falling' or 'centre'")
-        if not 0.0 < learning_time < np.inf:
-            raise ParameterError(f'learning_time {learning_time} s must be finite and above 0')
-        for name, value in (('minimum_interval', minimum_interval),
-                            ('minimum_difference', minimum_difference)):
-            if not 0.0 <= value < np.inf:
-                raise ParameterError(f'{name} {value} must be finite and not negative')
+        given = {'hysteresis': hysteresis, 'polarity': polarity, 'edge': edge,
+                 'minimum_interval': minimum_interval, 'learning_time': learning_time,
+                 'minimum_difference': minimum_difference, 'threshold': threshold or 0.0}
+        for item in DETECTOR_PARAMETERS:
+            item.convert(given.get(item.name, item.default))
         self._polarity = polarity
         self._given_threshold = threshold
         self._hysteresis = hysteresis
@@ -253,7 +246,7 @@ class KeyphasorDetector:
                 waiting, levels = self._decide(waiting, levels)
             self._levels = levels
             return np.concatenate([self._detect(piece) for piece in waiting])
-        if _alike(levels, known):
+        if levels.resembles(known, _DRIFTED):
             self._pending = None
             if not levels.resembles(known):
                 self._levels = levels
@@ -261,7 +254,8 @@ class KeyphasorDetector:
                 self._confirmed = True
                 self._trusted.append(levels)
         elif not self._confirmed or self._idle(window, known) or any(
-                _alike(levels, item) for item in (*self._trusted, self._pending) if item):
+                levels.resembles(item, _DRIFTED)
+                for item in (*self._trusted, self._pending) if item):
             self._levels, self._pending, self._confirmed = levels, None, False
         else:
             self._pending = levels
@@ -354,13 +348,6 @@ def _without_event(window: FloatArray, known: StateLevels) -> FloatArray:
     return window[~spikes] if places[-1] - places[0] < _EVENT * window.size else window
 
 
-def _alike(levels: StateLevels, known: StateLevels) -> bool:
-    """Whether levels may be those of the same signal, which has drifted."""
-    return (levels.steep == known.steep
-            and abs(levels.middle - known.middle) <= 0.5 * known.difference
-            and 0.5 <= levels.difference / known.difference <= 2.0)
-
-
 def _last(pieces: list[Piece], count: int) -> list[Piece]:
     """Return the last `count` samples of the pieces."""
     kept: list[Piece] = []
@@ -370,6 +357,13 @@ def _last(pieces: list[Piece], count: int) -> list[Piece]:
             kept.append((origin, index + skip, samples[skip:]))
             count -= samples.size
     return kept[::-1]
+
+
+def detector_of(values: Values) -> KeyphasorDetector:
+    """Return the detector with these parameters; raises `ParameterError`."""
+    return KeyphasorDetector(
+        threshold=None if values['automatic_threshold'] else values['threshold'],
+        **{name: values[name] for name in OPTIONS})
 
 
 def pulses_in_blocks(detector: KeyphasorDetector, blocks: Iterable[SampleBlock]) -> FloatArray:
@@ -417,11 +411,9 @@ def detect_pulses(
     True
     """
     detector = KeyphasorDetector(
-        threshold=None if threshold is None else number('threshold', threshold),
-        hysteresis=number('hysteresis', hysteresis), polarity=polarity, edge=edge,
-        interpolate=interpolate, minimum_interval=number('minimum_interval', minimum_interval),
-        learning_time=number('learning_time', learning_time),
-        minimum_difference=number('minimum_difference', minimum_difference))
+        threshold=threshold, hysteresis=hysteresis, polarity=polarity, edge=edge,
+        interpolate=interpolate, minimum_interval=minimum_interval, learning_time=learning_time,
+        minimum_difference=minimum_difference)
     sample_rate = number('sample_rate', sample_rate)
     start_time = number('start_time', start_time)
     samples = np.asarray(tach)

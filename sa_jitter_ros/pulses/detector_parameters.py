@@ -8,10 +8,9 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Parameters of a detector of pulses, and the detector that they make."""
+"""Parameters of a detector of pulses."""
 
-from sa_jitter_ros.parameters import Parameter, Values
-from sa_jitter_ros.pulses.detection import KeyphasorDetector
+from sa_jitter_ros.parameters import Parameter
 
 DETECTOR_PARAMETERS = (
     Parameter('automatic_threshold', True, 'learn the threshold from the low and high level of '
@@ -38,10 +37,3 @@ DETECTOR_PARAMETERS = (
 OPTIONS = ('hysteresis', 'polarity', 'edge', 'interpolate', 'minimum_interval', 'learning_time',
            'minimum_difference')
 DECISIVE = ('automatic_threshold', 'threshold', *OPTIONS)
-
-
-def detector_of(values: Values) -> KeyphasorDetector:
-    """Detector with these parameters; raises `ParameterError`."""
-    return KeyphasorDetector(
-        threshold=None if values['automatic_threshold'] else values['threshold'],
-        **{name: values[name] for name in OPTIONS})

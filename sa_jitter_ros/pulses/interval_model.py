@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 from sa_jitter_ros.pulses.pulse_chain import robust_square
-from sa_jitter_ros.pulses.pulse_paths import CERTAIN, LevelPrediction, OTHER, REACH
+from sa_jitter_ros.pulses.pulse_paths import LevelPrediction, OTHER, REACH
 
 FloatArray = NDArray[np.float64]
 
@@ -55,9 +55,6 @@ _WINDOW = 64  # intervals that show the tick of a clock
 _TICKS = tuple(0.75 * sum(abs(second - first) for first, second in pairwise(
     (0.0, 1.0, *(-item for item in reversed(weights)), 0.0))) for weights in _WEIGHTS)
 _OF_MARKS = 1.0
-# A shaft scatters more than was learnt if so many of the latest intervals differ by more than the
-# tolerance, but not by more than _NEAR; it is wider then than the largest of these by _WIDER.
-_SEVERAL, _OF_LATEST, _NEAR, _WIDER = 5, 24, 0.15, 1.5
 # Fractions of a trigger cycle: smallest tolerance, displacement that no average shows, distance of
 # two pulses of one mark. A pulse further off its expected time waits for the next one, which tells
 # if it was a stray; the nearer one of two is the pulse.
@@ -107,16 +104,17 @@ class IntervalModel:
         self.unsteady = unsteady
         self._levels = [level] * REACH
         self._variance = np.full(len(_WEIGHTS), scatter**2)
-        self._count = float(count)
-        #: so many intervals tell the scatter, at least one
-        self.degrees = max(self._count, 1.0)
-        self._chosen = 0
+        #: so many intervals tell the scatter
+        self.degrees = float(count)
+        #: number of the prediction that is the best one
+        self.chosen = 0
         self._settling = REACH
         self._intervals = deque(intervals, maxlen=self._window)
-        self._tick = self._latest = 0.0  # relative to the interval; and when it was seen (s)
+        #: of the clock, relative to the interval, 0 for none; and when it was seen (s)
+        self.tick = self._latest = 0.0
         self._lone = -math.inf, 0.0  # time and size (s) of the latest step that is in doubt
-        self._number = 0  # of intervals
-        self._refused: list[tuple[int, float]] = []
+        #: regular intervals since the beginning
+        self.taken = 0
         self._set_tolerance()
 
     @property
@@ -132,22 +130,12 @@ class IntervalModel:
     @property
     def has_tick(self) -> bool:
         """Whether the latest intervals are multiples of the tick of a clock."""
-        return bool(self._tick or clock_tick(np.array(self._intervals), 0.0))
-
-    @property
-    def tick(self) -> float:
-        """Tick of the clock, as far as one is known, in parts of the interval."""
-        return self._tick
+        return bool(self.tick or clock_tick(np.array(self._intervals), 0.0))
 
     @property
     def known(self) -> int:
         """Return the number of intervals from which the scatter is known."""
-        return int(self._count)
-
-    @property
-    def taken(self) -> int:
-        """Return the number of regular intervals since the beginning."""
-        return self._number
+        return int(self.degrees)
 
     @property
     def level(self) -> float:
@@ -155,30 +143,15 @@ class IntervalModel:
         return self._levels[-1]
 
     @property
-    def before(self) -> float:
-        """Level of the interval before the last one."""
-        return self._levels[-2]
-
-    @property
-    def slowed(self) -> int:
-        """Return how many of the last intervals were each longer than the one before."""
-        longer = [after > before for before, after in pairwise(self._levels[-REACH:])]
-        return next((k for k, item in enumerate(reversed(longer)) if not item), len(longer))
-
-    @property
     def recent(self) -> tuple[float, ...]:
+        """Levels of the last intervals."""
         return tuple(self._levels[-REACH:])
-
-    @property
-    def chosen(self) -> int:
-        """Return the number of the prediction that is the best one."""
-        return self._chosen
 
     @property
     def predictions(self) -> list[LevelPrediction]:
         """Return the predictions, each with how unlikely it is to be the best one."""
         variance = np.maximum(self._variance, (self._floor / _WIDTH)**2)
-        prices = np.minimum(OTHER, 0.5 * self._count * np.log(variance / variance.min()))
+        prices = np.minimum(OTHER, 0.5 * self.degrees * np.log(variance / variance.min()))
         if self._settling:
             prices[:] = 0.0
         return [LevelPrediction(float(price), weights in _LINES, weights)
@@ -187,7 +160,7 @@ class IntervalModel:
     @property
     def expected(self) -> float:
         """Return the expected level of the next interval."""
-        return _expected(_WEIGHTS[self._chosen], self._levels, len(self._levels))
+        return _expected(_WEIGHTS[self.chosen], self._levels, len(self._levels))
 
     def deviations(self, levels: list[float]) -> list[float]:
         """Return by how much each of the next levels is off, relative to its interval."""
@@ -197,32 +170,18 @@ class IntervalModel:
         settled = len(every) if self.given else min(place + self._settling, len(every))
         found = [min((expm1(min(every[number] - _expected(weights, every, number), _LARGEST))
                       for weights in _WEIGHTS), key=abs) for number in range(place, settled)]
-        weights = _WEIGHTS[self._chosen]
+        weights = _WEIGHTS[self.chosen]
         return found + [expm1(min(every[number] - _expected(weights, every, number), _LARGEST))
                         for number in range(settled, len(every))]
 
     def accept(self, levels: list[float], intervals: Sequence[float] = ()) -> None:
         """Take the next regular levels, at most `room`, and their intervals in s."""
-        self._number += len(levels)
+        self.taken += len(levels)
         self._levels += levels
         self._intervals.extend(intervals)
         self._settling = max(self._settling - len(levels), 0)
         if not self.room:
             self._learn()
-
-    def refuse(self, deviation: float) -> None:
-        """Take the deviation of a pulse that is dropped or ends a run; several widen the rest."""
-        if self.given or not abs(deviation) <= _NEAR:
-            return
-        self._refused = [(number, size) for number, size in self._refused
-                         if number > self._number - _OF_LATEST]
-        self._refused.append((self._number, abs(deviation)))
-        if len(self._refused) >= _SEVERAL:
-            scatter = _WIDER * max(size for _, size in self._refused) / _WIDTH
-            self._variance = np.maximum(self._variance, scatter**2)
-            self.degrees = CERTAIN  # it is wide on purpose
-            self._refused = []
-            self._set_tolerance()
 
     def jump(self, level: float) -> None:
         """Take a level that was not expected: the next ones may follow it."""
@@ -241,7 +200,7 @@ class IntervalModel:
         if np.any(np.abs(intervals / length - widths) > 2.0 * LONGEST_TICK):
             return False
         tick = clock_tick(np.array([*self._intervals, *intervals]), latest) / length
-        if tick <= self._tick:
+        if tick <= self.tick:
             return False
         # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
         lone = not clock_tick(np.array(self._intervals), latest)
@@ -250,30 +209,31 @@ class IntervalModel:
             known, self._lone = self._lone, (latest, tick * length)
             if opposite or not _is_repeated(known, self._lone, least=length):
                 return False
-        before, self._tick, self._latest = self.tolerance, tick, latest
+        before, self.tick, self._latest = self.tolerance, tick, latest
         self._set_tolerance()
         return self.tolerance > before
 
     def _learn(self) -> None:
         every, weight = np.array(self._levels), self.block / min(
-            self._count + self.block, _MEMORY)
+            self.degrees + self.block, _MEMORY)
         off = np.expm1(every[REACH:] - _ALL_WEIGHTS @ every[self._before])
         square = robust_square(np.minimum(off * off, self.tolerance**2))
         self._variance += weight * (square - self._variance)
-        self._count = self.degrees = min(self._count + self.block, _MEMORY)
-        self._chosen = int(np.argmin(self._variance))
+        self.degrees = min(self.degrees + self.block, _MEMORY)
+        self.chosen = int(np.argmin(self._variance))
         del self._levels[:-REACH]
-        if self._tick:  # the smallest so far; others may show that it is a fraction of that
+        if self.tick:  # the smallest so far; others may show that it is a fraction of that
             tick = clock_tick(np.array(self._intervals), self._latest) / math.exp(self.expected)
-            self._tick = min(self._tick, tick or self._tick)
+            self.tick = min(self.tick, tick or self.tick)
         self._set_tolerance()
 
     def _set_tolerance(self) -> None:
-        total = _PRIOR_COUNT * _PRIOR**2 + self._count * float(self._variance[self._chosen])
+        total = _PRIOR_COUNT * _PRIOR**2 + self.degrees * float(self._variance[self.chosen])
         #: standard deviation of the error of a prediction, relative to the interval
-        learnt = math.sqrt(total / (_PRIOR_COUNT + self._count)) * (1.0 + _UNCERTAIN / self._count)
+        learnt = math.sqrt(total / (_PRIOR_COUNT + self.degrees)) * (
+            1.0 + _UNCERTAIN / self.degrees)
         self.scatter = max(learnt, self._floor / _WIDTH,
-                           (_TICKS[self._chosen] + self._of_marks) * self._tick / _WIDTH)
+                           (_TICKS[self.chosen] + self._of_marks) * self.tick / _WIDTH)
         if self.given:
             self.scatter = min(self.scatter, self.given / _BELIEVED)
         #: the speed scatters so much that a missing pulse does not show

@@ -17,8 +17,8 @@ subtracted, and renewed after every `_RENEWED` revolutions. Where the pattern do
 mark is which, what was known before is not used, and `refused` counts it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,36 +33,7 @@ _LEARNT, _LONGEST = 100, 3.0  # revolutions and seconds
 _TRIED = (8, 32, _LEARNT)  # revolutions after which the pattern is looked for
 _RENEWED, _MEMORY = 50, 1000.0  # revolutions
 _LONG_GAP = 4  # revolutions that are not measured across
-_TRIMMED = 4096  # pulses
 _MESSAGES = 10
-
-
-@dataclass
-class _Run:
-    """
-    Pulses (n,) in a row, of which `seen` were measured and `sent` went on to the counter.
-
-    `numbers` (n,) of teeth count on from run to run, and begin anew where `passed` is None.
-    """
-
-    times: list[float]
-    numbers: list[int]
-    passed: int | None
-    restarted: bool
-    dropped: list[int] = field(default_factory=list)  # pulses behind which one was dropped
-    seen: int = 0
-    sent: int = 0
-    begun: bool = False  # in the counter, and closed there
-    closed: bool = False
-    ended: bool | None = None  # if so, whether its last pulse is known
-
-    def trim(self, kept: int) -> None:
-        """Forget pulses that were sent, but for the latest ones."""
-        count = self.sent - kept
-        if count > _TRIMMED:
-            del self.times[:count], self.numbers[:count]
-            self.seen, self.sent = self.seen - count, self.sent - count
-            self.dropped = [number - count for number in self.dropped]
 
 
 class MarkCorrector:
@@ -98,116 +69,112 @@ class MarkCorrector:
         self.refused = 0
         self.messages: list[str] = []
         self._marks = np.zeros(count)  # angle of each tooth that is subtracted, rad
-        self._runs: list[_Run] = []
-        self._restarted = False
         self._waits = True
         self._shift = 0  # teeth from mark 0 to number 0 of the present runs
+        self._calls: list[Callable[[], None]] = []  # of the counter, which wait
+        self._known_end = self._running = self._begun = self._dropped = False
+        self._new_times: list[float] = []
+        self._new_steps: list[int] = []
+        self._passed: int | None = None  # teeth from the run before to the first pulse
+        self._times, self._numbers = np.empty(0), np.empty(0, np.int64)  # the latest of the run
         self._measure_from_here()
 
     def begin(self, time: float, tooth: int, *, passed: int | None = None) -> None:
         """Begin a run at a pulse (s) of this tooth, `passed` teeth after the last run's end."""
         self.stop()
-        number = tooth
-        if passed is not None and self._runs and self._runs[-1].ended:
-            number = self._runs[-1].numbers[-1] + passed
-        else:
-            passed = None
-        self._runs.append(_Run([time], [number], passed, self._restarted))
-        self._restarted = False
+        self._passed = passed if self._known_end else None
+        number = tooth if self._passed is None else int(self._numbers[-1]) + self._passed
+        if self._passed is None:
+            self._wait_no_longer()
+            # Missing teeth show which tooth is which; even ones have to be found by their angles.
+            self._shift, self._waits = 0, True
+            self._measure_from_here()
+        elif self._passed > _LONG_GAP * self._count and not self._waits:
+            self._measure_from_here()
+        self._running, self._begun, self._dropped = True, False, False
+        self._times, self._numbers = self._times[:0], self._numbers[:0]
+        self._take(np.array([time]), np.array([number]))
 
     def extend(self, times: list[float], steps: list[int]) -> None:
         """Add pulses (s) to the run, each `steps` teeth after the one before."""
-        run = self._runs[-1]
-        run.numbers += np.cumsum([run.numbers[-1], *steps])[1:].tolist()
-        run.times += times
+        self._new_times += times
+        self._new_steps += steps
 
     def drop(self) -> None:
         """Record that a pulse behind the latest one was dropped."""
-        if self._runs and self._runs[-1].ended is None:
-            self._runs[-1].dropped.append(len(self._runs[-1].times) - 1)
+        self._measure()
+        self._dropped |= not self._begun
+        if self._begun:
+            self._calls.append(self._counter.drop)
 
     def stop(self, *, known: bool = True) -> None:
         """End the run; `known`: the last pulse is valid."""
-        if self._runs and (self._runs[-1].ended is None or not known):
-            self._runs[-1].ended = known
+        self._measure()
+        if self._running or not known:
+            if self._running and not self._begun:
+                self._begin(self._times, self._numbers)
+            self._calls.append(partial(self._counter.stop, known=known))
+            self._known_end, self._running = known, False
+            self._pass_on()
 
     def restart(self) -> None:
         """Mark the next run as one that starts after time ran back."""
-        self._restarted = True
+        self._calls.append(self._counter.restart)
 
     def take(self) -> TriggerPulses:
         """Return the new trigger pulses."""
-        for number in range(len(self._runs)):
-            self._measure(self._runs[:number + 1])
-        kept = [run for run in self._runs[:-1] if not run.closed]
-        self._runs = kept + self._runs[-1:]
-        for run in self._runs:
-            run.trim(self._count)
+        self._measure()
         return self._counter.take()
 
     def flush(self) -> TriggerPulses:
         """Return the trigger pulses that waited, because none follows."""
-        found = [self.take()]
-        if self._waits and self._times:
-            self._evaluate(last=True)
-            self._send(self._runs)
-        return TriggerPulses.joined([*found, self._counter.take()])
+        self._measure()
+        self._wait_no_longer()
+        return self._counter.take()
 
     # --- measuring ---
 
     def _measure_from_here(self) -> None:
         """Measure the angles from the next pulse on."""
-        self._times: list[FloatArray] = []
-        self._numbers: list[IntArray] = []
-        self._revolutions = 0.0
+        self._seen: list[tuple[FloatArray, IntArray]] = []
         self._deadline = np.inf
         self._wanted = float(_RENEWED)
         if self._waits:
             self._wanted = float(_LEARNT if self._known is None else _TRIED[0])
 
-    def _measure(self, runs: list[_Run]) -> None:
-        """Measure the new pulses of the last of these runs, and send what need not wait."""
-        run = runs[-1]
-        if not run.seen:
-            self._start(runs)
-        while run.seen < len(run.times):
-            times = np.array(run.times[run.seen:])
-            numbers = np.array(run.numbers[run.seen:], np.int64)
-            if self._waits and not self._times:
+    def _measure(self) -> None:
+        """Measure the new pulses of the run."""
+        if self._new_times:
+            times, steps = np.array(self._new_times), np.array(self._new_steps, np.int64)
+            self._new_times, self._new_steps = [], []
+            self._take(times, self._numbers[-1] + np.cumsum(steps))
+
+    def _take(self, times: FloatArray, numbers: IntArray) -> None:
+        """Measure the next pulses (n,) of the run, and pass on what need not wait."""
+        while times.size:
+            if self._waits and not self._seen:
                 self._deadline = float(times[0]) + _LONGEST
-            first = self._numbers[0][0] if self._numbers else numbers[0]
+            first = self._seen[0][1][0] if self._seen else numbers[0]
             due = (numbers - first >= self._wanted * self._count) | (
                 self._waits & (times >= self._deadline))
-            evaluates = bool(due.any())
-            count = int(np.argmax(due)) + 1 if evaluates else times.size
-            self._times.append(times[:count])
-            self._numbers.append(numbers[:count])
-            run.seen += count
-            if not self._waits:
-                self._send(runs)
-            if evaluates:
-                late = self._waits and (float(times[count - 1]) >= self._deadline
-                                        or self._wanted >= _LEARNT)
-                self._evaluate(last=late)
-        if not self._waits:
-            self._send(runs)
+            count = int(np.argmax(due)) + 1 if due.any() else times.size
+            self._seen.append((times[:count], numbers[:count]))
+            self._add(times[:count], numbers[:count])
+            if due.any():
+                self._evaluate(last=self._waits and (
+                    float(times[count - 1]) >= self._deadline or self._wanted >= _LEARNT))
+                self._pass_on()
+            times, numbers = times[count:], numbers[count:]
 
-    def _start(self, runs: list[_Run]) -> None:
-        """Begin to measure the last of these runs, of which the others came before."""
-        run = runs[-1]
-        if run.passed is None:
-            if self._waits and self._times:
-                self._evaluate(last=True)
-                self._send(runs[:-1])
-            # Missing teeth show which tooth is which; even ones have to be found by their angles.
-            self._shift, self._waits = 0, True
-            self._measure_from_here()
-        elif run.passed > _LONG_GAP * self._count and not self._waits:
-            self._measure_from_here()
+    def _wait_no_longer(self) -> None:
+        """Pass on what waits with the angles that the pulses so far show."""
+        if self._waits and self._seen:
+            self._evaluate(last=True)
+            self._pass_on()
 
     def _evaluate(self, *, last: bool) -> None:
         """Find the angles that the pulses show; `last`: they cannot wait for more."""
-        numbers, times = np.concatenate(self._numbers), np.concatenate(self._times)
+        times, numbers = (np.concatenate(each) for each in zip(*self._seen))
         teeth = np.unique(numbers % self._count)
         even = teeth.size == self._count
         found = measured_geometry(times, numbers, teeth, self._count)
@@ -225,9 +192,6 @@ class MarkCorrector:
                 self._wanted = float(min(item for item in _TRIED if item > self._wanted))
                 return
         elif self._waits or self.geometry is None:
-            if found is None and not self._waits:
-                self._wanted *= 2.0
-                return
             if self._learns:
                 self._use(found, teeth)
         elif found is not None:
@@ -263,47 +227,50 @@ class MarkCorrector:
         del self.messages[:-_MESSAGES]
         self._use(found, teeth)
 
-    # --- sending ---
+    # --- passing on ---
 
-    def _send(self, runs: list[_Run]) -> None:
-        """Pass on what was measured of these runs."""
-        for run in runs:
-            if run.sent < run.seen and (run.seen > 1 or run.ended is not None):
-                self._send_run(run)
-            if run.ended is not None and not run.closed and run.sent == len(run.times):
-                self._counter.stop(known=run.ended)
-                run.closed = True
+    def _add(self, times: FloatArray, numbers: IntArray) -> None:
+        """Add pulses (n,) of the run to what the counter is to take; the first one waits."""
+        known = self._times.size
+        times, numbers = np.append(self._times, times), np.append(self._numbers, numbers)
+        if known:
+            if not self._begun:
+                self._begin(times, numbers)
+            self._calls.append(lambda: self._counter.extend(
+                self._corrected(times, numbers)[known:].tolist(),
+                np.diff(numbers[known - 1:]).tolist()))
+            self._pass_on()
+        self._times, self._numbers = times[-self._count:], numbers[-self._count:]
 
-    def _send_run(self, run: _Run) -> None:
-        times = self._corrected(run).tolist()
-        first, steps = run.sent, np.diff(run.numbers[max(run.sent - 1, 0):run.seen]).tolist()
-        if not run.begun:
-            if run.restarted:
-                self._counter.restart()
-            tooth = (run.numbers[0] + self._shift) % self._count
-            self._counter.begin(times[0], tooth, passed=run.passed)
-            run.begun, times, first = True, times[1:], 1
-        for last in sorted({*(item + 1 for item in run.dropped if item < run.seen), run.seen}):
-            count = last - first
-            self._counter.extend(times[:count], steps[:count])
-            times, steps, first = times[count:], steps[count:], last
-            if last - 1 in run.dropped:
-                self._counter.drop()
-        run.dropped = [item for item in run.dropped if item >= run.seen]
-        run.sent = run.seen
+    def _begin(self, times: FloatArray, numbers: IntArray) -> None:
+        """Begin the run in the counter with the first of its pulses (n,)."""
+        passed = self._passed
+        self._calls.append(lambda: self._counter.begin(
+            float(self._corrected(times, numbers)[0]),
+            int(numbers[0] + self._shift) % self._count, passed=passed))
+        self._calls += [self._counter.drop] * self._dropped
+        self._begun = True
 
-    def _corrected(self, run: _Run) -> FloatArray:
-        """Return the times of the pulses of a run that are sent next, without their angles."""
-        begin = max(run.sent - self._count, 0)
-        times = np.array(run.times[begin:run.seen])
-        numbers = np.array(run.numbers[begin:run.seen], np.int64) + self._shift
-        late = self._marks[numbers % self._count]
-        chosen = np.arange(run.sent - begin, times.size)
+    def _pass_on(self) -> None:
+        """Tell the counter all that need not wait."""
+        if not self._waits:
+            calls, self._calls = self._calls, []
+            for call in calls:
+                call()
+
+    def _corrected(self, times: FloatArray, numbers: IntArray) -> FloatArray:
+        """Return the times of pulses (n,) of a run without the angles of their marks."""
+        late = self._marks[(numbers + self._shift) % self._count]
         if times.size == 1 or not late.any():
-            return times[chosen]
+            return times
         # The speed is that of the revolution before, as far as it is there.
-        before = np.maximum(chosen - np.count_nonzero(self._marks), 0)
-        before[chosen == 0] = 1
+        place = np.arange(times.size)
+        before = np.maximum(place - np.count_nonzero(self._marks), 0)
+        before[0] = 1
         angle = 2.0 * np.pi / self._count * (numbers - numbers[0]) + late
-        pace = (times[chosen] - times[before]) / (angle[chosen] - angle[before])
-        return np.asarray(times[chosen] - late[chosen] * pace)
+        pace = (times - times[before]) / (angle - angle[before])
+        return np.asarray(times - late * pace)
+
+
+#: What takes accepted pulses.
+PulseSink = TriggerCounter | MarkCorrector

@@ -49,12 +49,14 @@ class MarkPattern:
     scatter: float
 
 
-def mark_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPattern | None:
+def mark_pattern(marks: IntArray, levels: FloatArray, count: int, *,
+                 significant: float = _SIGNIFICANT) -> MarkPattern | None:
     """
     Return what repeats in the levels (n,) of consecutive intervals, None if they are too few.
 
     The interval i begins at the mark `marks[i]` of `count`; its level is the logarithm of its
-    length, NaN where it is not known.
+    length, NaN where it is not known. Widths that scatter less than `significant` variances of
+    their means are 0.
 
     >>> late = np.tile([0.1, -0.1, 0.0, 0.0], 5)
     >>> pattern = mark_pattern(np.arange(20) % 4, late + 0.001 * np.arange(20), 4)
@@ -89,13 +91,15 @@ def mark_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPattern
     scatter = 1.48 * float(np.median(np.abs(every)))
     per_mark = every.size / np.count_nonzero(known_marks)
     widths[known_marks] -= widths[known_marks].mean()
-    return MarkPattern(_shrunk(widths, known_marks, scatter**2 / per_mark), known_marks, scatter)
+    return MarkPattern(_shrunk(widths, known_marks, scatter**2 / per_mark, significant),
+                       known_marks, scatter)
 
 
-def _shrunk(widths: FloatArray, known: BoolArray, variance: float) -> FloatArray:
+def _shrunk(widths: FloatArray, known: BoolArray, variance: float,
+            significant: float = _SIGNIFICANT) -> FloatArray:
     """Return widths (mark,), those not `known` 0, as far as their variance is no explanation."""
     between = float(np.mean(widths[known]**2))
-    if between <= _SIGNIFICANT * variance:
+    if between <= significant * variance:
         return np.zeros(widths.size)
     return np.asarray(widths * (1.0 - variance / between))
 
@@ -179,12 +183,10 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     unlike = np.abs(slopes - (np.median(slopes[near]) if near.any() else 0.0))
     found = [(tolerance, np.flatnonzero((apart <= tolerance) & near & (
         unlike <= _UNLIKE * tolerance))) for tolerance in _REPEATING]
-    # Of few marks some repeat by chance: most of those without a stray have to.
-    often = [item for item in found if item[1].size > _CLEAN * np.count_nonzero(near)]
-    seldom = [item for item in found if item[1].size]
-    if not seldom:
+    found = [item for item in found if item[1].size]
+    if not found:
         return None
-    tolerance, fits = (often or seldom)[0]
+    tolerance, fits = found[0]
     begin = int(fits[0])
     slope = float(slopes[begin]) / count
     two = (levels[begin:begin + 2 * count].reshape(2, count)

@@ -20,7 +20,7 @@ from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.pulses.pulse_paths import MARGIN, Path, PathRules, Step
+from sa_jitter_ros.pulses.pulse_paths import Path, PathRules, Step
 from scipy.ndimage import median_filter
 
 FloatArray = NDArray[np.float64]
@@ -89,13 +89,13 @@ def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRA
     every = Chain(np.arange(pulses.size), np.ones(intervals.size, np.int64), levels)
     if np.all(np.minimum(np.abs(change), np.abs(turn)) <= _REGULAR):
         return every
-    best, doubt, cheapest = _most_likely(pulses, scatter, stray)
+    best, cheapest = _most_likely(pulses, scatter, stray)
     unsteady = unsteadiness(levels)
     # If both explanations take all pulses for true, the scatter of the speed is the better one.
     if unsteady and ((best is not None and set(best.marks) == {1})
                      or levels.size * (_each(unsteady) + 0.5) < cheapest):
         return replace(every, unsteady=True)
-    if best is None or doubt or best.cost > _CHAIN_COST * pulses.size:
+    if best is None or best.cost > _CHAIN_COST * pulses.size:
         return None
     marks = np.array(best.marks, np.int64)
     true = np.flatnonzero(marks)
@@ -111,14 +111,13 @@ def _each(scatter: float) -> float:
 
 
 def _most_likely(pulses: FloatArray, scatter: float | None, stray: float
-                 ) -> tuple[Path | None, bool, float]:
+                 ) -> tuple[Path | None, float]:
     """
     Return the most likely acceptable path of pulses (n,), None without any.
 
-    Beside it, whether another path with the same scatter is far more likely, and the cost of the
-    most likely path of all.
+    Beside it, the cost of the most likely path of all.
     """
-    best, doubt, cheapest = None, False, math.inf
+    best, cheapest = None, math.inf
     for tried in _LADDER if scatter is None else (*_LADDER, scatter):
         rules = PathRules((1,), (1.0,), tried, (0.0,), 1, None, stray=stray, each=_each(tried),
                           most=_MOST_PATHS)
@@ -130,8 +129,8 @@ def _most_likely(pulses: FloatArray, scatter: float | None, stray: float
         cheapest = min(cheapest, paths[0].cost)
         found = next((path for path in paths if _acceptable(path.marks)), None)
         if found is not None and (best is None or found.cost < best.cost):
-            best, doubt = found, found.cost > paths[0].cost + MARGIN
-    return best, doubt, cheapest
+            best = found
+    return best, cheapest
 
 
 def unsteadiness(levels: FloatArray) -> float:

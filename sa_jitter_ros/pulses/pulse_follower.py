@@ -32,12 +32,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from sa_jitter_ros.pulses.alternation import Alternation
 from sa_jitter_ros.pulses.interval_model import IntervalModel
+from sa_jitter_ros.pulses.mark_corrector import PulseSink
 from sa_jitter_ros.pulses.mark_pattern import mark_pattern
 from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
 from sa_jitter_ros.pulses.target import Lock
-from sa_jitter_ros.pulses.trigger_counter import PulseSink
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
 _MOST_WAITING = 10  # doubtful pulses, until the match is lost
@@ -56,6 +55,9 @@ REVOLUTIONS = 5
 #: intervals by which a gap may differ from a whole number of them
 NEAR_WHOLE = 0.2
 _NEVER = 1 << 62
+# Intervals that show whether every other one is longer: by how much at least, and by how many
+# times their variance.
+_TURNS, _LEAST_TURNS, _SURE_TURNS = 256, 2e-5, 100.0
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class PulseFollower:
         self.times: list[float] = []
         self._learnt = 0  # times that the pattern was learnt
         self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
-        self._alternation = Alternation()
+        self._alternates = False
         self._recent: list[float] = []  # of the latest pulses, dropped ones too
         verdicts.counts['accepted'] += 1
         self.confirmed = queue.pop(0)
@@ -160,12 +162,17 @@ class PulseFollower:
 
     def _look_at_turns(self, levels: list[float]) -> None:
         """Say that intervals of one mark are longer and shorter in turns."""
-        known = self._alternation.size
-        self._alternation.update(levels)
-        size = abs(self._alternation.size)
-        if not size or known or self._probe or self._model.has_tick:
+        self.levels += levels
+        if self._probe or len(self.levels) < _TURNS:
             return
-        usual = math.exp(0.5 * (self._model.level + self._model.before))
+        every = np.array(self.levels)
+        pattern = mark_pattern(np.arange(every.size) % 2, every, 2, significant=_SURE_TURNS)
+        size = 0.0 if pattern is None else abs(float(pattern.widths[0]))
+        self.levels = []
+        if size < _LEAST_TURNS or self._alternates or self._model.has_tick:
+            return
+        self._alternates = True
+        usual = math.exp(0.5 * sum(self._model.recent[-2:]))
         self._verdicts.say(
             f'the pulse intervals are longer and shorter in turns, {usual * math.exp(size):.6g} s '
             f'and {usual * math.exp(-size):.6g} s: are they pulses of two keyphasors of one name, '
@@ -205,8 +212,7 @@ class PulseFollower:
         if self._is_of_clock():
             return True
         rules = self._rules()
-        paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent,
-                      using=model.chosen, slowed=model.slowed)]
+        paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent, using=model.chosen)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
             paths = rules.extend(paths, pulse)
             if (number or len(queue) == 1) and self._commit(paths, final):
@@ -273,7 +279,6 @@ class PulseFollower:
     def _drop_stray(self) -> None:
         gap = self._queue[0] - self.confirmed
         expected = math.exp(self._model.expected) * float(self._lock.widths[self.slot])
-        self._model.refuse(gap / expected - 1.0)
         self._drop('doubles' if gap < 0.5 * expected else 'early')
         recent = np.diff(self._recent)
         mean = float(recent.mean()) if recent.size == _AGREEING else np.inf
@@ -300,19 +305,15 @@ class PulseFollower:
         model, tolerance = self._model, self._tolerance
         slots, steps = self._passed(mark)
         gap = self._queue[0] - self.confirmed
-        regular = abs(deviation) <= tolerance
-        known = self._is_whole(gap, slots, model.level) and (
-            after is None or self._is_whole(gap, slots, after))
         if mark == 1 and after is not None and abs(math.expm1(level - model.level)) <= max(
                 _RAMP, self._options.tolerance):
             low, high = sorted((model.level, after))
-            changes = low - tolerance <= level <= high + tolerance  # the speed does
-            if changes:
+            if low - tolerance <= level <= high + tolerance:  # the speed changes
                 pulse = self._next(slots, level)
                 model.jump(level)
                 self._sink.extend([pulse], [steps])
                 return
-        if mark > 1 and regular:
+        if mark > 1 and abs(deviation) <= tolerance:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
             self._verdicts.counts[kind] += mark - 1
             self._verdicts.rejected += [
@@ -320,21 +321,18 @@ class PulseFollower:
                 for number in range(1, min(mark, _MOST_WAITING))]
             pulse = self._next(slots, level)
             model.accept([level])
-            if self._lacks_alike(mark, gap):
+            if self._lacks_alike(mark, gap) or not self._options.bridge:
                 self._sink.begin(pulse, 0, passed=steps)
-            elif self._options.bridge:
-                self._sink.extend([pulse], [steps])
             else:
-                self._sink.begin(pulse, 0, passed=steps)
+                self._sink.extend([pulse], [steps])
             return
         self._verdicts.reject(self._queue[0], 'late')
-        if mark == 1:
-            model.refuse(deviation)
-        if not known and mark == 1 and after is not None:
-            passed = self._slots_in(gap, model.level, self.slot)
-            if passed and passed == self._slots_in(gap, after, self.slot):
-                slots, steps = self._passed(passed)
-                known = True
+        passed = self._slots_in(gap, model.level, self.slot)
+        if after is not None and passed != self._slots_in(gap, after, self.slot):
+            passed = 0
+        known = passed == mark or (mark == 1 and after is not None and passed > 0)
+        if known:
+            slots, steps = self._passed(passed)
         # A step of the time may be whole by chance: uneven marks tell which of them comes next.
         long = gap > _LONG * float(self._lock.widths.sum()) * math.exp(model.level)
         if (not known or long) and (self._probe or not self._lock_is_plain):
@@ -394,7 +392,8 @@ class PulseFollower:
 
     def _next(self, slots: list[int], level: float) -> float:
         """Take the first pulse out of the queue as the one at the end of these slots."""
-        self._alternation = Alternation()
+        if self._lock.steps.size == 1:
+            self.levels, self._alternates = [], False
         pulse = self._queue.pop(0)
         self._remember(pulse)
         self._verdicts.counts['accepted'] += 1
@@ -420,11 +419,6 @@ class PulseFollower:
         if abs(float(ends[nearest]) - rest) > NEAR_WHOLE:
             return 0
         return int(turns) * widths.size + nearest
-
-    def _is_whole(self, gap: float, slots: list[int], level: float) -> bool:
-        """Whether intervals of this level make the gap (s) the whole number of teeth."""
-        width = float(self._lock.widths[slots].sum())
-        return abs(gap / math.exp(level) - width) <= NEAR_WHOLE
 
     @property
     def _room_of_marks(self) -> int:

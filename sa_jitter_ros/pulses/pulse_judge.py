@@ -12,16 +12,18 @@
 Judges pulses by what the shaft can do: finds a sequence, follows it, and finds it again.
 
 `pulse_start` finds the first pulses and the speed, `pulse_follower` decides which of the next ones
-are true. If nothing explains ten pulses, the match is lost and a start is looked for again.
+are true. If nothing explains ten pulses, the match is lost and a start is looked for again. With
+the tolerance 1 all pulses are taken for true, as is right for a clean encoder on a shaft whose
+speed changes from one pulse to the next by more than a shaft is expected to.
 """
 
 import math
 
 from sa_jitter_ros.pulses.loose_marks import LooseMarks
+from sa_jitter_ros.pulses.mark_corrector import PulseSink
 from sa_jitter_ros.pulses.pulse_follower import JudgeOptions, NEAR_WHOLE, PulseFollower
 from sa_jitter_ros.pulses.pulse_start import End, new_model, PulseStart
 from sa_jitter_ros.pulses.target import Lock, Target
-from sa_jitter_ros.pulses.trigger_counter import PulseSink
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
 _SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after it
@@ -41,6 +43,7 @@ class PulseJudge:
 
     def __init__(self, target: Target, counter: PulseSink, options: JudgeOptions) -> None:
         self._target, self._counter, self._options = target, counter, options
+        self._every = options.tolerance == 1.0
         self.verdicts = Verdicts()
         self._model = new_model(target, options)
         self.forget()
@@ -68,7 +71,7 @@ class PulseJudge:
     @property
     def hides_missing(self) -> bool:
         """Whether the speed scatters so much that strays and missing pulses do not show."""
-        return bool(self._model.hides_missing)
+        return self._every or bool(self._model.hides_missing)
 
     @property
     def waiting(self) -> int:
@@ -84,6 +87,9 @@ class PulseJudge:
             else:
                 self._queue.append(pulse)
                 last = pulse
+        if self._every:
+            self._pass_all()
+            return
         self._loose.update(self._queue[waited:])
         self._run(final=False)
 
@@ -93,7 +99,7 @@ class PulseJudge:
 
     def fits(self, gap: float) -> bool:
         """Whether a pulse at this interval (s) from the last one would be regular."""
-        return self._follower is not None and self._follower.fits(gap)
+        return self._every or (self._follower is not None and self._follower.fits(gap))
 
     def drop_later(self, time: float, most: int) -> int:
         """Drop the waiting pulses after a time (s) if they are `most` or fewer; their number."""
@@ -103,6 +109,18 @@ class PulseJudge:
         del self._queue[-later:]
         self._start.drop_later()
         return later
+
+    def _pass_all(self) -> None:
+        """Take the pulses of the queue for true."""
+        pulses = self._queue[:]
+        if not pulses:
+            return
+        self.verdicts.counts['accepted'] += len(pulses)
+        if not math.isfinite(self._confirmed):
+            self._counter.begin(pulses.pop(0), 0)
+        self._counter.extend(pulses, [1] * len(pulses))
+        self._confirmed = self._queue[-1]
+        self._queue.clear()
 
     def _run(self, *, final: bool) -> None:
         while self._queue:
@@ -141,7 +159,7 @@ class PulseJudge:
             known_better = end.known >= max(_KNOWN_WELL, count)
             if known_better or 1.0 / _SAME_SCATTER < scatter / end.scatter < _SAME_SCATTER:
                 scatter, count = end.scatter, max(count, end.known)
-        self._counter.begin(first, int(lock.teeth[lock.slot]), passed=passed)
+        self._counter.begin(first, lock.tooth, passed=passed)
         model.start(math.log(lock.interval), scatter=scatter, count=count,
                     intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
         follower = PulseFollower(lock, self._queue, model, options=self._options,

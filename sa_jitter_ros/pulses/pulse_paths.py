@@ -20,6 +20,7 @@ decided.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 import math
 from operator import itemgetter, mul
 from typing import NamedTuple
@@ -83,7 +84,6 @@ class Path(NamedTuple):
     `last` (s) is the last true pulse, at `slot` and `passed` teeth from where the path began,
     `recent` are the levels of the last intervals. With `jumped` the speed is no longer that of
     earlier intervals. The prediction number `using` is used. `stray_at` (s) is the latest stray.
-    The last `slowed` intervals were each longer than the one before.
     """
 
     cost: float
@@ -92,7 +92,6 @@ class Path(NamedTuple):
     passed: int = 0
     recent: tuple[float, ...] = ()
     using: int = 0
-    slowed: int = 0
     jumped: bool = False
     steps: tuple[Step, ...] = ()
     stray_at: float = -math.inf
@@ -167,8 +166,7 @@ class PathRules:
                 else:
                     true = true._replace(
                         recent=(*path.recent, *(level,) * mark)[-REACH:], using=using)
-                slower = bool(path.recent) and level > path.recent[-1]
-                yield true._replace(slowed=path.slowed + 1 if slower else 0)
+                yield true
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
 
@@ -192,7 +190,7 @@ class PathRules:
                 continue
             cost = 0.0 if number == path.using else cost
             yield cost, slopes, sum(map(mul, weights, recent[-size:])), number
-            if size == 2 and path.slowed >= _SLOWED and recent[-1] > recent[-2]:
+            if size == 2 and _slows(recent):
                 for level in slowing(recent[-1], recent[-2]):
                     yield cost, slopes, level, number
 
@@ -220,6 +218,12 @@ class PathRules:
             given = math.expm1(level - self.expected)
         best = min(best, JUMP) if expected else 0.0
         return min(best, BELIEVED) if abs(given) <= self.given[path.slot] else best, off, using
+
+
+def _slows(recent: Sequence[float]) -> bool:
+    """Return whether the latest intervals were each longer than the one before."""
+    return len(recent) > _SLOWED and all(
+        after > before for before, after in pairwise(recent[-1 - _SLOWED:]))
 
 
 def slowing(level: float, before: float) -> list[float]:

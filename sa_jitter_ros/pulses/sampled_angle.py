@@ -19,14 +19,14 @@ a jump of the angle; the few samples of a glitch are left out.
 
 from dataclasses import dataclass
 import math
-from typing import Any, cast
+from typing import Any
 import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number
-from sa_jitter_ros.pulses.angle_runs import AngleRuns
+from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
 
 FloatArray = NDArray[np.float64]
 
@@ -40,12 +40,11 @@ _STEPS = 512  # steps of the angle, from which its resolution follows
 _MULTIPLE, _MOST = 0.02, 0.9  # of a step; share of the steps that are multiples of the resolution
 _MEMORY = 0.98  # weight of the errors before, at each crossing
 _DITHER = 1.5  # counts; less back is no reversal of a counter
-_REGISTERS = (2.0**8, 2.0**16, 2.0**32)  # ranges of counters
 _MOST_BEFORE = 1 << 14  # samples before the shaft turns
 _MOST_AT_ONCE = 50_000_000  # pulses
 _LEAST_MODULUS = 4.0  # counts; with fewer the direction cannot be told
 _USUALLY = 0.9  # of the counts are within the range of a counter
-_EXACT = 2.0**53  # the largest count that is exact
+_EXACT = 2.0 / np.finfo(np.float64).eps  # the largest count that is exact
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,8 @@ class AngleCrossings:
         self._stops = self._reversals = self._restarts = 0
         self._latest = -math.inf  # time of the latest sample
         self._steps = np.empty(0)
-        self._left = self._freedom = self._leverage = self._slowness = 0.0
+        self._left = self._freedom = 0.0  # of the latest crossings
+        self._leverage_slowness = np.zeros(2)
         self._begin()
 
     def _begin(self) -> None:
@@ -130,8 +130,9 @@ class AngleCrossings:
         error = noise = math.nan
         if self._freedom > 0.0:
             variance = self._left / self._freedom
-            error = math.sqrt(variance * self._leverage)
-            rounding = resolution * self._slowness / math.sqrt(12.0)
+            leverage, slowness = self._leverage_slowness.tolist()
+            error = math.sqrt(variance * leverage)
+            rounding = resolution * slowness / math.sqrt(12.0)
             noise = math.sqrt(max(variance - rounding**2, 0.0))
         runs = self._runs
         return AngleState(self._samples, self._dropped, self._pulses, runs.gaps, self._stops,
@@ -303,16 +304,13 @@ class AngleCrossings:
         factors = np.einsum('ips,is->ip', inverse, y)
         left = y - np.einsum('isp,ip->is', powers, factors)
         result[moving] = origin + factors[:, 0]
-        leverage = np.sum(inverse[:, 0] ** 2, axis=1)
-        slowness = (y[:, -1] - y[:, 0]) / span  # s a rad
-        for k in range(len(left)):  # a recursion over crossings, not over samples
-            self._left = _MEMORY * self._left + float(left[k] @ left[k])
-            self._freedom = _MEMORY * self._freedom + (_BEFORE + _AFTER - 3)
-            weight = 1.0 / (1.0 + min(self._freedom / 3.0, 1.0 / (1.0 - _MEMORY)))
-            self._leverage += weight * (float(leverage[k]) - self._leverage) if (
-                self._leverage) else float(leverage[k])
-            self._slowness += weight * (float(slowness[k]) - self._slowness) if (
-                self._slowness) else float(slowness[k])
+        latest = np.column_stack((  # leverage, and s a rad
+            np.sum(inverse[:, 0] ** 2, axis=1), (y[:, -1] - y[:, 0]) / span))
+        free = _BEFORE + _AFTER - 3
+        for rest, each in zip(left, latest):  # a recursion over crossings, not over samples
+            self._left = _MEMORY * self._left + float(rest @ rest)
+            self._freedom = _MEMORY * self._freedom + free
+            self._leverage_slowness += free / self._freedom * (each - self._leverage_slowness)
         return result
 
     def _resolution(self) -> float:
@@ -340,7 +338,8 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
     size = np.quantile(np.abs(counts), _USUALLY)
     low, high = np.quantile(counts, (1.0 - _USUALLY, _USUALLY))
     below = (0.0,) if low >= 0.0 else (1.0,) if high <= 0.0 else (0.0, 0.5, 1.0)
-    registers = [each for each in (turn, *_REGISTERS) if each >= max(size, _LEAST_MODULUS)]
+    registers = [each for each in (turn, *(2.0**bits for bits in BITS))
+                 if each >= max(size, _LEAST_MODULUS)]
     steps = np.diff(counts)
     falls = np.flatnonzero(np.abs(steps) > 0.5 * (np.ptp(counts) + 1.0))
     usual = 2.0 * float(np.median(np.abs(steps))) + 2.0 if steps.size else 0.0
@@ -354,6 +353,13 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
             registers.append(span)
     return AngleRuns(turn, moduli=(modulus,) if modulus else (), registers=tuple(registers),
                      below=below, counts=True)
+
+
+def _of_counter(counts: FloatArray, marks: int, modulus: float = 0.0) -> AngleCrossings:
+    """Return the crossings of a counter, a turn of which is the modulus if `marks` divide it."""
+    turn = modulus if modulus and modulus % marks == 0.0 else float(marks)
+    return AngleCrossings(marks=marks, turn=turn, counted=turn == marks,
+                          runs=counter_runs(counts, turn, modulus))
 
 
 def counter_pulses(
@@ -381,11 +387,8 @@ def counter_pulses(
     if not (np.isfinite(sample_rate) and sample_rate > 0.0):
         raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
     times = np.arange(values.size) / sample_rate
-    marks = int(pulses_per_revolution)
-    angle = values.astype(np.float64)
-    crossings = AngleCrossings(marks=marks, turn=float(marks), counted=True,
-                               runs=counter_runs(angle, float(marks)))
-    pulses = np.append(crossings.update(times, angle), crossings.flush())
+    crossings = _of_counter(values.astype(np.float64), int(pulses_per_revolution))
+    pulses = np.append(crossings.update(times, values), crossings.flush())
     return start_time + pulses, crossings.state
 
 
@@ -443,11 +446,7 @@ def pulses_from_angle(
         if np.any(np.abs(finite) > _EXACT):
             raise SignalError(f'a count of {np.max(np.abs(finite)):.0f} is above 2^53 and not '
                               'exact: subtract the first one')
-        divides = modulus is not None and modulus % marks == 0.0
-        turn = cast(float, modulus) if divides else marks
-        crossings = AngleCrossings(
-            marks=int(marks), turn=turn, counted=turn == marks,
-            runs=counter_runs(finite, turn, modulus or 0.0))
+        crossings = _of_counter(finite, int(marks), modulus or 0.0)
     else:
         crossings = AngleCrossings(marks=int(marks), runs=AngleRuns(
             _TURN, moduli=(_TURN, modulus) if modulus else (_TURN,)))

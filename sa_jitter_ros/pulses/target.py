@@ -18,7 +18,6 @@ tells which tooth caused each of them.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -51,10 +50,10 @@ class Lock:
     """
     How the latest pulses fit a target, from pulse number `first` on, which is tooth `slot`.
 
-    For every tooth present (m,), counted from the index: `steps` to the next one in teeth, `teeth`
-    its number, and `widths`, the steps with what is known of uneven marks. Deviations of the
-    interval behind it within `believed` are expected as long as the widths are not known.
-    `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`;
+    For every tooth present (m,), counted from the index: `steps` to the next one in teeth, and
+    `widths`, the steps with what is known of uneven marks. Deviations of the interval behind it
+    within `believed` are expected as long as the widths are not known. `interval` (s) is the first
+    time from tooth to tooth; `known` intervals had the `scatter`;
     `intervals` (k,) in s are those from tooth to tooth. If `unsteady`, the speed scatters.
     """
 
@@ -62,13 +61,17 @@ class Lock:
     slot: int
     interval: float
     steps: IntArray
-    teeth: IntArray
     widths: FloatArray
     believed: FloatArray
     scatter: float
     known: int
     intervals: FloatArray
     unsteady: bool = False
+
+    @property
+    def tooth(self) -> int:
+        """Return the number of the tooth of the first pulse."""
+        return int(self.steps[:self.slot].sum())
 
     @cached_property
     def even(self) -> bool:
@@ -106,24 +109,6 @@ def index_of(steps: IntArray) -> int:
     return max(range(steps.size), key=lambda k: tuple(np.roll(steps, -k)[::-1]))
 
 
-class Target(Protocol):
-    """What the pulse validator needs to know of a target."""
-
-    marks: int
-    memory: int
-
-    def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
-                  ) -> int:
-        """
-        Return how many of the waiting pulses to match next, after the first `tried` ones.
-
-        It `failed` so often before, or found a lock that was lost soon.
-        """
-
-    def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
-        """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
-
-
 class EvenTarget:
     """Equal or nearly equal angles: several intervals that follow each other are a lock."""
 
@@ -142,9 +127,7 @@ class EvenTarget:
         if pulses.size < _FEWEST:
             return _FEWEST
         interval = float(np.median(np.diff(pulses[:_FEWEST])))
-        first = _FEWEST
-        if not known and interval * _FEWEST < _LEARNING_TIME:
-            first = int(_LEARNING_TIME / interval) if interval * _MOST > _LEARNING_TIME else _MOST
+        first = _FEWEST if known else int(np.clip(_LEARNING_TIME / interval, _FEWEST, _MOST))
         more = 2 << min(failed // 2, _DOUBLED)
         return first + min(more - 2, _MORE) if tried < first else tried + more
 
@@ -173,7 +156,7 @@ class EvenTarget:
         levels = np.log(gaps / found.steps)
         ones = np.ones(self.marks, dtype=np.int64)
         return Lock(first=start + int(found.pulses[0]), slot=0, interval=float(np.exp(levels[0])),
-                    steps=ones, teeth=np.arange(self.marks), widths=ones.astype(np.float64),
+                    steps=ones, widths=ones.astype(np.float64),
                     believed=np.zeros(self.marks), scatter=found.scatter, known=levels.size,
                     intervals=gaps[found.steps == 1], unsteady=found.unsteady)
 
@@ -190,8 +173,8 @@ class ToothedWheel:
 
     >>> wheel = ToothedWheel(teeth=8, missing=1, tolerance=0.25)
     >>> lock = wheel.lock(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0]), None)
-    >>> lock.slot, lock.steps.tolist(), lock.teeth.tolist()
-    (2, [1, 1, 1, 1, 1, 1, 2], [0, 1, 2, 3, 4, 5, 6])
+    >>> lock.slot, lock.tooth, lock.steps.tolist()
+    (2, 2, [1, 1, 1, 1, 1, 1, 2])
     """
 
     def __init__(self, *, teeth: int, missing: int, tolerance: float) -> None:
@@ -239,8 +222,7 @@ class ToothedWheel:
                     slot = -index % steps.size
                     levels = np.log(intervals / np.roll(steps, -slot))
                     return Lock(first=int(single[0]), slot=slot, interval=float(guess[0]),
-                                steps=steps, teeth=np.cumsum(steps) - steps,
-                                widths=steps.astype(np.float64),
+                                steps=steps, widths=steps.astype(np.float64),
                                 believed=np.where(tolerance > self._tolerance, tolerance, 0.0),
                                 scatter=Chain(single, steps, levels).scatter,
                                 known=levels.size, intervals=intervals[np.roll(steps, -slot) == 1])
@@ -251,3 +233,6 @@ class ToothedWheel:
         next_to_gap = np.roll(gap, 1) | np.roll(gap, -1)
         tolerance = np.where(next_to_gap, max(self._tolerance, _BESIDE_GAP), self._tolerance)
         return np.where(gap, np.minimum(_BESIDE_GAP, _ACROSS_GAP / steps), tolerance)
+
+
+Target = EvenTarget | ToothedWheel

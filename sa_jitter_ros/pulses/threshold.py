@@ -94,10 +94,10 @@ class StateLevels:
         """Return the size of the smaller lobe beside the resting level."""
         return min(self.high - self.resting, self.resting - self.low)
 
-    def resembles(self, known: 'StateLevels') -> bool:
-        """Return whether these levels differ so little from known ones that those are kept."""
+    def resembles(self, known: 'StateLevels', within: float = _DEAD_BAND) -> bool:
+        """Return whether the middle differs from a known one by less than a part of the size."""
         return (self.steep == known.steep
-                and abs(self.middle - known.middle) <= _DEAD_BAND * known.difference
+                and abs(self.middle - known.middle) <= within * known.difference
                 and 0.5 <= self.difference / known.difference <= 2.0)
 
     def negated(self) -> 'StateLevels':
@@ -194,27 +194,26 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
 
     Without them there are many more pulses, in a smaller range.
     """
-    kept = samples
+    kept, spikes, longest = samples, 0, 0
     for _ in range(_SIZES):
-        if kept.size < 3:
+        low, high = (float(kept.min()), float(kept.max())) if kept.size else (0.0, 0.0)
+        if high - low <= 10 * _BINS * np.spacing(max(abs(low), abs(high))):  # one level is left
             break
-        low, high = float(kept.min()), float(kept.max())
         outside = kept > 0.5 * (low + high)
         if 2 * np.count_nonzero(outside) > kept.size:
             outside = ~outside
         begin, end = _runs(outside)
-        rest = kept[~outside]
-        levels = _lobes(rest) or _modes(rest)
-        if not levels.significant:
-            break
-        above = rest > 0.5 * (levels.low + levels.high)
-        pulses, over = _runs(above if 2 * np.count_nonzero(above) < rest.size else ~above)
-        short = max(_SHORT, 0.5 * float(np.median(over - pulses))) if pulses.size else 0.0
-        if begin.size > max(_FEW_SPIKES, pulses.size // _PULSES_EACH) or (
-                pulses.size <= begin.size) or np.max(end - begin) > short:
-            break
-        kept = rest
-    return kept
+        spikes, longest = spikes + begin.size, max(longest, int(np.max(end - begin)))
+        kept = kept[~outside]
+        levels = _lobes(kept) or _modes(kept)
+        if levels.significant:
+            above = kept > 0.5 * (levels.low + levels.high)
+            pulses, over = _runs(above if 2 * np.count_nonzero(above) < kept.size else ~above)
+            short = max(_SHORT, 0.5 * float(np.median(over - pulses))) if pulses.size else 0.0
+            few = spikes <= max(_FEW_SPIKES, pulses.size // _PULSES_EACH)
+            if few and spikes < pulses.size and longest <= short:
+                return kept
+    return samples
 
 
 def _beside_motion(samples: FloatArray) -> StateLevels | None:

@@ -11,7 +11,6 @@
 """From accepted pulses to trigger pulses, by counting teeth."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -53,31 +52,6 @@ class TriggerPulses:
             return cls(np.empty(0), none, none, no_numbers, none, none, no_numbers)
         return cls(*(np.concatenate([getattr(part, name) for part in parts])
                      for name in cls.__dataclass_fields__))
-
-
-class PulseSink(Protocol):
-    """What takes accepted pulses: a `TriggerCounter`, or what stands in front of it."""
-
-    def begin(self, time: float, tooth: int, *, passed: int | None = None) -> None:
-        """Begin a run at a pulse (s) of this tooth, `passed` teeth after the last run's end."""
-
-    def extend(self, times: list[float], steps: list[int]) -> None:
-        """Add pulses (s) to the run, each `steps` teeth after the one before."""
-
-    def drop(self) -> None:
-        """Record that a pulse behind the latest one was dropped."""
-
-    def stop(self, *, known: bool = True) -> None:
-        """End the run; `known`: the last pulse is valid."""
-
-    def restart(self) -> None:
-        """Mark the next run as one that starts after time ran back."""
-
-    def take(self) -> TriggerPulses:
-        """Return the new trigger pulses."""
-
-    def flush(self) -> TriggerPulses:
-        """Return the last trigger pulses, because none follows."""
 
 
 class TriggerCounter:
@@ -153,16 +127,14 @@ class TriggerCounter:
             self._count()
         self._numbering = numbering
 
-    def flush(self) -> TriggerPulses:
-        """Return the last trigger pulses: none waits here."""
-        return self.take()
-
     def take(self) -> TriggerPulses:
         """Return the new trigger pulses."""
         if self.running:
             self._count()
         found, self._found = self._found, []
         return TriggerPulses.joined(found)
+
+    flush = take  # none waits here
 
     def _count(self) -> None:
         numbers = np.array(self._steps).cumsum()

@@ -146,14 +146,15 @@ def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
                         'the one before: give them in order of time, numpy.sort(pulse_times)'),)
     duration, span = end - start, float(np.ptp(times))
     spans = _spans(times, duration)
+    other = Mistake('span', f'{spans}: give pulse times in s, and sample_rate in Hz')
     if span > _MUCH * duration:
-        return _other_unit(spans, span / duration, rate)
+        return _other_unit(spans, span / duration, rate) or (other,)
     if span * _MUCH**2 < duration:
         if 0.5 / _FACTOR < 1e3 * span / duration < _FACTOR:
             return (Mistake(
                 'unit_khz', f'{spans}: the sampling rate of {rate:g} Hz looks like kHz; give '
                 f'sample_rate={1e3 * rate:.10g}', rate_scale=1e3),)
-        return (Mistake('span', f'{spans}: give pulse times in s, and sample_rate in Hz'),)
+        return (other,)
     if times.max() < start or times.min() > end:
         apart = (f'the pulses come from {times.min():.6g} s to {times.max():.6g} s, when there is '
                  'no vibration: ')
@@ -176,8 +177,6 @@ def _other_unit(spans: str, factor: float, rate: float) -> tuple[Mistake, ...]:
         away = math.log(factor / unit)
         if abs(away) < math.log(_FACTOR):
             weights[name] = math.exp(-0.5 * (away / (_LONGER if away > 0.0 else _SHORTER)) ** 2)
-    if not weights:
-        return (Mistake('span', f'{spans}: give pulse times in s, and sample_rate in Hz'),)
     return tuple(Mistake(
         f'unit_{name}', f'{spans}: the pulse times look like {units[name][0]}; divide them by '
         f'{units[name][1]:g} to have seconds', scale=1.0 / units[name][1],

@@ -29,13 +29,12 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.every_pulse import EveryPulse
-from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
+from sa_jitter_ros.pulses.mark_corrector import MarkCorrector, PulseSink
 from sa_jitter_ros.pulses.pulse_follower import JudgeOptions
 from sa_jitter_ros.pulses.pulse_judge import PulseJudge
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
-from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter, TriggerPulses
+from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
 __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
@@ -99,7 +98,7 @@ class PulseValidator:
     :param missing_pulses: 'bridge' interpolates missing pulses between their neighbours, 'break'
         discards the trigger cycle.
     :param interval_tolerance: of an interval, as a fraction of the expected one; 0 learns it from
-        the scatter of the intervals, 1 accepts every pulse (`every_pulse`).
+        the scatter of the intervals, 1 accepts every pulse.
     :param maximum_missing: more missing pulses than this in a row are a standstill.
     :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
     :param time_tolerance: time (s) by which a pulse may be early before a new run begins.
@@ -172,9 +171,7 @@ class PulseValidator:
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
             pulses_per_trigger=per_trigger)
-        self._judge: PulseJudge | EveryPulse = (
-            EveryPulse(self._sink, options) if every
-            else PulseJudge(target, self._sink, options))
+        self._judge = PulseJudge(target, self._sink, options)
         self.pulses_per_revolution, self.pulses_per_trigger = teeth, per_trigger
         self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
