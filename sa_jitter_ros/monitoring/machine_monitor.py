@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
@@ -30,7 +30,6 @@ from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingState
 from sa_jitter_ros.monitoring.quantities import Layout, monitored, MonitoredAverage
 
-FloatArray = NDArray[np.float64]
 
 #: Topics of a shaft whose arrays make one average, by the names of their arrays.
 KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',

@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine, UNKNOWN
@@ -31,7 +31,6 @@ from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.parameters import Parameter, Values
 from scipy import special
 
-FloatArray = NDArray[np.float64]
 
 YEAR = 365.25 * 86400.0  # s
 # Bins: the machine passes through more of them in a run-up than it stays in.
@@ -463,14 +462,14 @@ class ShaftMonitor:
 
     # --- state ---
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Array]:
         """Return what `restore` needs: arrays by names. Groups that are not full are left out."""
         return {**self._test.state(), 'products': self._products,
                 'intervals': np.array(self._intervals),
                 'place': np.array([self._bins.speed, self._bin, self._end, self.averages,
                                    self._bins.state])}
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: dict[str, Array]) -> None:
         """Go on from a state; raises KeyError and ValueError for one of something else."""
         self._test.restore(state)
         if state['products'].shape != self._products.shape or (

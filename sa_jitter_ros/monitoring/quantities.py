@@ -23,13 +23,12 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.averaging.results import (
     AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS)
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.machine import Machine
 
-FloatArray = NDArray[np.float64]
 
 # Power of the amplitude in the numerator of each indicator: a relative error of all amplitudes
 # changes the indicator by at most so many times as much.
@@ -206,7 +205,7 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
         _readings(table, (values, variance), (amplitude / mean, (error / amplitude) ** 2)))
 
 
-def best_amplitudes(table: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def best_amplitudes(table: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """
     Return amplitudes (..., order) of a table and their errors, the raw ones without a correction.
 

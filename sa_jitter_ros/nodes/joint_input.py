@@ -13,12 +13,10 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.nodes.messages import decode_time
 from sa_jitter_ros.pulses.sampled_angle import AngleCrossings
-
-FloatArray = NDArray[np.float64]
 
 
 class JointInput:

@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging import results
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
@@ -36,7 +37,6 @@ from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
 
-FloatArray = NDArray[np.float64]
 ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 
 AMPLITUDE_FIELDS = results.AMPLITUDE_FIELDS

@@ -17,7 +17,7 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
@@ -28,7 +28,6 @@ from sa_jitter_ros.parameters import Parameter, TACH_TYPE, Values
 from sa_jitter_ros.samples import SampleBlock
 from std_msgs.msg import Float64MultiArray
 
-FloatArray = NDArray[np.float64]
 
 TRANSPORT_BYTES_PER_SECOND = 100e6
 MAX_LAG = 0.5  # s; a stream that lags more continues from now instead of catching up

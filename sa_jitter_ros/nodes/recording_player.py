@@ -17,7 +17,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
@@ -29,7 +29,6 @@ from sa_jitter_ros.recordings.channel_units import in_units, scale_of
 from sa_jitter_ros.recordings.fields import fields_of
 from sa_jitter_ros.samples import SampleBlock
 
-FloatArray = NDArray[np.float64]
 
 PARAMETERS = (
     Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),

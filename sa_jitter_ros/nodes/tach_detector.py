@@ -17,7 +17,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
@@ -30,7 +30,6 @@ from sa_jitter_ros.parameters import (
 from sa_jitter_ros.pulses.detector_parameters import DECISIVE, detector_of, DETECTOR_PARAMETERS
 from sensor_msgs.msg import JointState
 
-FloatArray = NDArray[np.float64]
 
 # Once the state levels are learnt, the detector finds all pulses of the window. Subscribers
 # queue 200 messages and may be busy with an average: the pulses are published in portions.

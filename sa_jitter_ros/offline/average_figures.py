@@ -13,9 +13,10 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    Array, CORRECTED, heading, legend_under, MEASURED, RAW, rows_of_channels, strongest_channels)
+    CORRECTED, heading, legend_under, MEASURED, RAW, rows_of_channels, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _UNKNOWN = 0.3  # standard error of an attenuation that says nothing

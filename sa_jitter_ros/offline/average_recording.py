@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
 from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
@@ -43,7 +42,6 @@ from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
 from sa_jitter_ros.tacholess.recording import Tacholess
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 

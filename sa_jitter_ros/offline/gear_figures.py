@@ -12,11 +12,12 @@
 
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import gear_lines, GearSettings, separate
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    Array, CORRECTED, heading, MARK, MEASURED, rows_of_channels, strongest_channels)
+    CORRECTED, heading, MARK, MEASURED, rows_of_channels, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 

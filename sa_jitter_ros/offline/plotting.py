@@ -16,11 +16,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.series import ShaftSeries
 
-Array = NDArray[Any]
 
 RAW, CORRECTED, MEASURED, MARK = 'tab:red', 'tab:blue', 'black', 'tab:orange'
 MOST_CHANNELS = 3

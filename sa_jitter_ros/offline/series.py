@@ -18,14 +18,12 @@ All averages of a shaft as arrays (average, ...), collected in files so that mem
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.results import AverageMessage
 from sa_jitter_ros.pulses.resampling import periodic
 
-Array = NDArray[Any]
 
 # Names of the arrays where they are not those of the topics, and of the header.
 _NAMES = {'synchronous_average': 'waveform'}

@@ -16,11 +16,11 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import gear_lines, GearSettings
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    Array, CORRECTED, heading, legend_under, MARK, rows_of_channels, speed_varies,
-    strongest_channels)
+    CORRECTED, heading, legend_under, MARK, rows_of_channels, speed_varies, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _MOST_COLUMNS = 500  # of a map; more averages share one

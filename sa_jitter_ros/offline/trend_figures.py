@@ -15,11 +15,12 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.monitoring.quantities import Layout
 from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.files import Signals
-from sa_jitter_ros.offline.plotting import Array, draw_limits, heading, speed_varies
+from sa_jitter_ros.offline.plotting import draw_limits, heading, speed_varies
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _FEWEST = 2  # averages

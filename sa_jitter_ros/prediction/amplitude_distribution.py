@@ -21,17 +21,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import unit_nodes
 from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.prediction.sampled_distribution import require_probabilities
 from scipy.special import ndtr, ndtri
 
-Array = NDArray[Any]
 
 _REACH = 8.5  # standard deviations; 2e-17 of a normal distribution lies outside
 _NODES, _MOST_STEEP = 48, 8  # 1e-9 of a distribution function; times as many where it is steep

@@ -26,7 +26,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution, curved_along
 from sa_jitter_ros.prediction.angle_error import (
@@ -44,7 +45,6 @@ from sa_jitter_ros.prediction.sampled_distribution import (
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
 from sa_jitter_ros.pulses.angle_law import LINEAR_LAW
 
-Array = NDArray[Any]
 
 # Cycles up to which the distribution is sampled under effects. Of independent pulse errors, as
 # many as leave the curved one 0.005 off in its CDF: more under a bent law, as many again for each

@@ -29,14 +29,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.pulses.angle_law import Covariance, LINEAR, PulseWeights
 
-Array = NDArray[Any]
 
 _RANK = 1e-9  # variance of what is left out of drawn processes, over the largest component's
 

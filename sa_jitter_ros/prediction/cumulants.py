@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, permutations
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess,
     IndependentPulseJitter,
@@ -34,7 +34,6 @@ from sa_jitter_ros.prediction.moments import (
     require_orders,
 )
 
-Array = NDArray[Any]
 
 _REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1

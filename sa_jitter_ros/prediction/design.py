@@ -20,10 +20,10 @@ average (`comb`), and all of them how small a change one average shows (`detecti
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, unwrapped
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
@@ -34,7 +34,6 @@ from sa_jitter_ros.prediction.moments import cycle_moments, require_orders
 from sa_jitter_ros.prediction.prediction import predict
 from scipy.optimize import brentq
 
-Array = NDArray[Any]
 
 #: Distributions of pulse errors that are as wide as the keyphasor rate makes them.
 RATE_DISTRIBUTIONS = ('uniform', 'normal', 'triangular')

@@ -26,7 +26,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import (
     angle_spread,
@@ -36,7 +37,6 @@ from sa_jitter_ros.prediction.angle_error import (
 )
 from sa_jitter_ros.prediction.distributions import is_number
 
-Array = NDArray[Any]
 
 NODES = 64
 _NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly

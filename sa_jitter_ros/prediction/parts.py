@@ -20,10 +20,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.moments import AverageMoments
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

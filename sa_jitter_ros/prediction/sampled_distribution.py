@@ -22,7 +22,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, unit_nodes
 from sa_jitter_ros.prediction.distributions import Empirical
@@ -30,7 +31,6 @@ from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.pulses.angle_law import LINEAR, PulseWeights
 
-Array = NDArray[Any]
 #: ``known(count)``: pulse errors (count, pulse) in fundamental cycles of as many averages.
 KnownErrors = Callable[[int], Array]
 

@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap, find_channel
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 Opened = Callable[[], AbstractContextManager[Any]]
 

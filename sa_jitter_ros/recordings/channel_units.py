@@ -21,12 +21,11 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.recordings.recording import ChangedSource, Recording
 
-FloatArray = NDArray[np.float64]
 #: Channels by name, each with `unit` and `sensitivity`, in the order of the machine file.
 Channels = Mapping[str, Mapping[str, Any]]
 

@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError, RecordingError, SignalError
 from sa_jitter_ros.pulses.sampled_angle import counter_pulses
-from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
+from sa_jitter_ros.recordings.recording import ArraySource, MAX_PULSES, Recording
 
 _MAX_SAMPLE_BYTES = 1 << 40
 _MAX_PULSE_BYTES = 8 * MAX_PULSES

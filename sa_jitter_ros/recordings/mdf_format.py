@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.libraries import library
-from sa_jitter_ros.recordings.recording import FloatArray, Recording
+from sa_jitter_ros.recordings.recording import Recording
 
 
 def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:

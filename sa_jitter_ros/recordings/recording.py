@@ -15,17 +15,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.samples import SampleBlock, unresolved_times
 
-FloatArray = NDArray[np.float64]
 
 _MAX_CHANNELS = 4096
 MAX_PULSES = 50_000_000
@@ -50,7 +49,7 @@ class SampleSource(Protocol):
 class ArraySource:
     """Samples of an array or a memory map (`channel` x `sample`, any real dtype)."""
 
-    array: NDArray[Any]
+    array: Array
 
     @property
     def channels(self) -> int:

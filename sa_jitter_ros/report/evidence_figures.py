@@ -12,12 +12,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.prediction import predict
@@ -26,7 +25,6 @@ from sa_jitter_ros.report.expected_errors import (
     cycle_places, lags_of, Version, versions_of, with_explained_errors)
 from sa_jitter_ros.report.plotting import add_legend, AFTER, BEFORE, MEASURED, panels
 
-Array = NDArray[Any]
 Words = Callable[[float], str]  # an order in a sentence
 
 _MICRO = 1e6

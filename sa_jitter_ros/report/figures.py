@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import effects_of
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
@@ -30,7 +30,6 @@ from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import (
     add_legend, AFTER, arrange, BEFORE, MEASURED, panels, with_effects)
 
-Array = NDArray[Any]
 
 _FEWEST_CYCLES = 3
 _MOST_PANELS = 3

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.tacholess.evidence import comb, CombSpectra, spectra_of
 from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
 
-FloatArray = NDArray[np.float64]
 
 _WINDOWS = (24.0, 12.0, 6.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
