@@ -11,7 +11,7 @@
 """
 Recordings in files that hold a list of channels, each with its own name, unit, rate and start.
 
-Formats of measuring systems are such lists (`tdms_format`, `mdf_format`, `uff_format`).
+Formats of measuring systems are such lists (`list_formats`).
 """
 
 from collections import Counter
