@@ -25,8 +25,12 @@ _UNKNOWN = 0.3  # standard error of an attenuation that says nothing
 def waveform_figure(signals: Signals, series: ShaftSeries) -> Figure:
     """Draw the latest synchronous average of the strongest channels over the angle."""
     channels = strongest_channels(series)
-    figure, panels = rows_of_channels(signals, channels)
     angle, raw = 360.0 * series['angle'], series['waveform'][-1]
+    shown = f'{len(channels)} strongest of {raw.shape[0]} channels, ' if (
+        raw.shape[0] > len(channels)) else ''
+    figure, panels = rows_of_channels(signals, series, channels, (
+        f'{shown}last average, {series["fundamental_cycles"][-1]:.0f} revolutions, tach shaft at '
+        f'{series["trigger_speed"][-1]:.4g} Hz'), 'angle of the shaft [degrees]')
     error = 2.0 * series['standard_error'][-1]
     for axes, channel in zip(panels[:, 0], channels):
         axes.fill_between(angle, raw[channel] - error[channel], raw[channel] + error[channel],
@@ -36,12 +40,6 @@ def waveform_figure(signals: Signals, series: ShaftSeries) -> Figure:
             axes.plot(angle, series['corrected_average'][-1, channel], color=CORRECTED,
                       linewidth=0.8, label='corrected')
         axes.margins(x=0.0)
-    shown = f'{len(channels)} strongest of {raw.shape[0]} channels, ' if (
-        raw.shape[0] > len(channels)) else ''
-    figure.suptitle(heading(signals, series, (
-        f'{shown}last average, {series["fundamental_cycles"][-1]:.0f} revolutions, tach shaft at '
-        f'{series["trigger_speed"][-1]:.4g} Hz')), fontsize='medium')
-    panels[-1, 0].set_xlabel('angle of the shaft [degrees]')
     legend_under(panels[-1, 0])
     return figure
 

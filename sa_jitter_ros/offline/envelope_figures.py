@@ -15,7 +15,7 @@ import numpy as np
 from sa_jitter_ros.averaging.envelope import SLIP
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    heading, legend_under, MARK, MEASURED, rows_of_channels, squared, strongest_channels)
+    legend_under, MARK, MEASURED, rows_of_channels, squared, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 
@@ -29,7 +29,9 @@ def envelope_figure(signals: Signals, series: ShaftSeries) -> Figure | None:
     if not known.any():
         return None
     channels = strongest_channels(series)
-    figure, panels = rows_of_channels(signals, channels)
+    figure, panels = rows_of_channels(signals, series, channels, (
+        'squared-envelope order spectrum of the residual signal, RMS of '
+        f'{np.count_nonzero(known)} averages'), 'order (multiple of the shaft speed)')
     rms = np.sqrt(np.mean(spectrum[known] ** 2, axis=0))
     for axes, channel in zip(panels[:, 0], channels):
         for number, order in enumerate(found[known][0, channel, :, 0].tolist()):
@@ -48,9 +50,5 @@ def envelope_figure(signals: Signals, series: ShaftSeries) -> Figure | None:
         axes.set_ylabel(f'{signals.channel_names[channel]}\nsquared envelope [{unit}]')
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.0)
-    figure.suptitle(heading(signals, series, (
-        'squared-envelope order spectrum of the residual signal, RMS of '
-        f'{np.count_nonzero(known)} averages')), fontsize='medium')
-    panels[-1, 0].set_xlabel('order (multiple of the shaft speed)')
     legend_under(panels[-1, 0])
     return figure

@@ -20,7 +20,7 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import gear_lines, GearSettings
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    CORRECTED, heading, legend_under, MARK, rows_of_channels, speed_varies, strongest_channels)
+    CORRECTED, legend_under, MARK, rows_of_channels, speed_varies, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _MOST_COLUMNS = 500  # of a map; more averages share one
@@ -82,13 +82,12 @@ def spectra(series: ShaftSeries) -> Spectra:
 def spectrum_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear: GearSettings
                     ) -> Figure:
     """Draw the full order spectrum, with mesh harmonics, sidebands and tracked orders."""
-    figure, panels = rows_of_channels(signals, found.channels, height=2.7)
+    figure, panels = rows_of_channels(
+        signals, series, found.channels, f'full order spectrum, RMS of {len(series)} averages',
+        'order (multiple of the shaft speed)', height=2.7)
     corrected = 'corrected' if 'corrected_average' in series else 'raw'
     for axes, amplitude, noise in zip(panels[:, 0], found.rms, found.noise):
         _draw_spectrum(axes, signals, series, amplitude, noise, gear, corrected)
-    figure.suptitle(heading(signals, series, (
-        f'full order spectrum, RMS of {len(series)} averages')), fontsize='medium')
-    panels[-1, 0].set_xlabel('order (multiple of the shaft speed)')
     legend_under(panels[-1, 0], columns=5)
     return figure
 
@@ -129,7 +128,9 @@ def order_map_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear
         return None
     highest = _highest(series, found, gear)
     varies = speed_varies(series)
-    figure, panels = rows_of_channels(signals, found.channels, height=2.9, columns=1 + varies)
+    figure, panels = rows_of_channels(
+        signals, series, found.channels, 'order map', 'time [s]',
+        *['speed of the tach shaft [Hz]'] * varies, height=2.9)
     for row, place in zip(panels, range(len(found.channels))):
         decibels = 20.0 * np.log10(np.maximum(found.amplitude[:, place, 1:highest + 1], 1e-300))
         top = float(decibels.max())
@@ -139,10 +140,6 @@ def order_map_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear
         unit = signals.units[found.channels[place]] or 'unit'
         figure.colorbar(image, ax=row[-1], label=f'dB re 1 {unit}')
         row[0].set_ylabel(f'{signals.channel_names[found.channels[place]]}\norder')
-    figure.suptitle(heading(signals, series, 'order map'), fontsize='medium')
-    panels[-1, 0].set_xlabel('time [s]')
-    if varies:
-        panels[-1, 1].set_xlabel('speed of the tach shaft [Hz]')
     return figure
 
 
