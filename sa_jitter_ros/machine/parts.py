@@ -50,8 +50,27 @@ class Part:
             object.__setattr__(self, name, value)
 
 
+class Coupling(Part):
+    """A part that couples two shafts, whose names are the values of `ENDS`."""
+
+    ENDS: ClassVar[tuple[str, str]] = ('shaft', 'mate_shaft')
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """Return the shafts that the part couples."""
+        first, second = (getattr(self, name) for name in self.ENDS)
+        return first, second
+
+    def check(self, place: str) -> None:
+        """Check the values; raises ParameterError, which names the place in the file."""
+        super().check(place)
+        if len({*self.ends}) < 2:
+            raise ParameterError(f'{place}: {" and ".join(self.ENDS)} are both {self.ends[0]}: '
+                                 'give two shafts')
+
+
 @dataclass(frozen=True)
-class GearPair(Part):
+class GearPair(Coupling):
     """
     Two gears in mesh, with the numbers of their teeth.
 
@@ -67,13 +86,6 @@ class GearPair(Part):
     KINDS: ClassVar = {'shaft': _SHAFT, 'teeth': _TEETH, 'mate_shaft': _SHAFT,
                        'mate_teeth': _TEETH}
 
-    def check(self, place: str) -> None:
-        """Check the values; raises ParameterError, which names the place in the file."""
-        super().check(place)
-        if self.shaft == self.mate_shaft:
-            raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: gears in '
-                                 'mesh are on two shafts')
-
     @property
     def ratio(self) -> Fraction:
         """Return the speed of the mate's shaft over that of the shaft."""
@@ -88,11 +100,6 @@ class GearPair(Part):
     def hunting_tooth(self) -> Fraction:
         """Return the order, of the shaft, at which the same two teeth meet."""
         return Fraction(self.assembly_phases, self.mate_teeth)
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Return the shafts that the pair couples."""
-        return self.shaft, self.mate_shaft
 
     def orders(self, name: str, shaft: str) -> dict[str, float]:
         """Return the orders of one of the shafts by name, `name` being that of the mesh."""
@@ -110,7 +117,7 @@ class GearPair(Part):
 
 
 @dataclass(frozen=True)
-class Belt(Part):
+class Belt(Coupling):
     """A belt or chain between two shafts: `ratio` is the speed of the mate's over the shaft's."""
 
     shaft: str
@@ -119,24 +126,13 @@ class Belt(Part):
     KINDS: ClassVar = {'shaft': _SHAFT, 'mate_shaft': _SHAFT,
                        'ratio': Parameter('ratio', 1.0, 'ratio of speeds', above=0.0)}
 
-    def check(self, place: str) -> None:
-        """Check the values; raises ParameterError, which names the place in the file."""
-        super().check(place)
-        if self.shaft == self.mate_shaft:
-            raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: give two')
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Return the shafts that the belt couples."""
-        return self.shaft, self.mate_shaft
-
     def orders(self, name: str, shaft: str) -> dict[str, float]:
         """Return no orders: a belt has no teeth in mesh."""
         return {}
 
 
 @dataclass(frozen=True)
-class PlanetaryStage(Part):
+class PlanetaryStage(Coupling):
     """
     A planetary stage, of which one of sun, ring and carrier is fixed.
 
@@ -158,6 +154,7 @@ class PlanetaryStage(Part):
     input_shaft: str
     output_shaft: str
     input: str | None = None  # noqa: A003 (the key of the machine file)
+    ENDS: ClassVar = ('input_shaft', 'output_shaft')
     MEMBERS: ClassVar = ('sun', 'ring', 'carrier')
     KINDS: ClassVar = {
         **dict.fromkeys(('sun', 'ring', 'planet'), _TEETH),
@@ -172,9 +169,6 @@ class PlanetaryStage(Part):
         if self.input == self.fixed:
             raise ParameterError(f'{place}.input is {self.input}, which is fixed: give another '
                                  'member')
-        if self.input_shaft == self.output_shaft:
-            raise ParameterError(f'{place}: input_shaft and output_shaft are both '
-                                 f'{self.input_shaft}: give two shafts')
         whose = (f'{place} does not assemble: sun {self.sun}, planet {self.planet}, ring '
                  f'{self.ring}')
         if abs(self.ring - self.sun - 2 * self.planet) > _SHIFTED:
@@ -212,11 +206,6 @@ class PlanetaryStage(Part):
         """Return the speed of the output shaft over that of the input shaft."""
         first, second = self.on_shafts
         return abs(self.speeds[second] / self.speeds[first])
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Return the shafts that the stage couples."""
-        return self.input_shaft, self.output_shaft
 
     def orders(self, name: str, shaft: str) -> dict[str, float]:
         """Return the orders of one of the shafts by name; relative to the carrier."""
