@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import unit_nodes
-from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.prediction.sampled_distribution import require_probabilities
 from scipy.special import ndtr, ndtri
@@ -186,16 +185,6 @@ class AmplitudeDistribution:
         """Return P(std_along T <= x)."""
         t = _ratio(x, self.std_along[:, None, None])
         return np.asarray(ndtr(_straight(t, self.skew[:, None, None])))
-
-
-def curved_distribution(moments: AverageMoments, unmixed: Array, mixed: Array
-                        ) -> AmplitudeDistribution:
-    """
-    Return the distribution of |X| for an average with third cumulants, in the frame of its phase.
-
-    `unmixed` is k(X, X, X), `mixed` is k(X, X, conj X).
-    """
-    return curved_along(Parts.about(moments.mean, moments, unmixed, mixed))
 
 
 def curved_along(parts: Parts) -> AmplitudeDistribution:

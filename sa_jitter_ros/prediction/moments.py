@@ -21,7 +21,7 @@ pulse, so lag 1 belongs in every variance.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -80,18 +80,11 @@ class AverageMoments:
 
     def shifted(self, shift: ArrayLike) -> 'AverageMoments':
         """Return the moments of X + shift."""
-        return AverageMoments(self.mean + np.asarray(shift), self.variance, self.pseudo_variance)
-
-    def scaled(self, gain: ArrayLike) -> 'AverageMoments':
-        """Return the moments of gain * X."""
-        g = np.asarray(gain)
-        return AverageMoments(self.mean * g, self.variance * np.abs(g) ** 2,
-                              self.pseudo_variance * g**2)
+        return replace(self, mean=self.mean + np.asarray(shift))
 
     def with_noise(self, variance: ArrayLike) -> 'AverageMoments':
         """Return the moments of X + n with circular noise of variance E|n|^2."""
-        return AverageMoments(self.mean, self.variance + np.asarray(variance),
-                              self.pseudo_variance)
+        return replace(self, variance=self.variance + np.asarray(variance))
 
 
 @dataclass(frozen=True)
