@@ -24,9 +24,10 @@ from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.monitoring.limits import LimitWatch
-from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
+from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.monitoring.operating import OperatingState
+from sa_jitter_ros.monitoring.quantities import KINDS
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import first_of, Flow
 from sa_jitter_ros.nodes.messages import decode_average, known_type

@@ -24,7 +24,6 @@ from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
-from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
     finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, stamp,
@@ -178,8 +177,7 @@ class RecordingAverager:
                     results['order_amplitude'], self._found.correct(average, ratio=(
                         settings.cycle_length / settings.revolutions_per_trigger)))
             if self.limits.names:
-                self.passed += self.limits.update(name, monitored(
-                    results[KINDS[0]], *map(results.get, KINDS[1:])))
+                self.passed += self.limits.update(name, monitored(results))
             yield name, results, average.refused
 
 

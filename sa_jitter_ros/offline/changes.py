@@ -29,11 +29,9 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import memory_of
 from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
-from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingBins
-from sa_jitter_ros.monitoring.quantities import (
-    mean_of, monitored, MonitoredAverage)
+from sa_jitter_ros.monitoring.quantities import KINDS, mean_of, monitored, MonitoredAverage
 from sa_jitter_ros.offline.files import read_averages, Signals, waveforms
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.offline.settings import section
@@ -257,10 +255,8 @@ def _recorded(output: Path, name: str, signals: Signals, series: Sequence[ShaftS
     means: dict[str, MonitoredAverage] = {}
     discarded, refusal = 0, f'has no channel {state}'
     for item in series:
-        averages = [
-            monitored(parts[KINDS[0]], *map(parts.get, KINDS[1:]),
-                      allow_uncorrected=settings.allow_uncorrected)
-            for parts in item.messages(KINDS, kept, np.array(orders[item.shaft]))]
+        averages = [monitored(parts, allow_uncorrected=settings.allow_uncorrected)
+                    for parts in item.messages(KINDS, kept, np.array(orders[item.shaft]))]
         if state:
             values = () if place is None else waveforms(output / name, item.shaft)[:, place]
             averages = [replace(average, state=float(value.mean()))
