@@ -11,7 +11,7 @@
 """One recording: its averages in files, by a function of a job that any process can do."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,11 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
 from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
-from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, stamp,
-    write_averages)
+    finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, write_averages)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -39,7 +37,6 @@ from sa_jitter_ros.recordings.channel_check import (
     channel_faults, fault_texts, is_lost, without_channels)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
-from sa_jitter_ros.tacholess.recording import Tacholess
 
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
@@ -50,22 +47,19 @@ _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AverageJob(RecordingJob):
     """
     One recording to average.
 
-    `options` are keywords of `read`; `fields` among them are those that the user gave. The channel
-    `state`, a name or a number, may be constant. With `tacholess` the pulses are found in the
-    vibration.
+    `fields` among the options are those that the user gave. The channel `state`, a name or a
+    number, may be constant.
     """
 
     machine: MachineFile
-    options: Mapping[str, Any] = field(default_factory=dict)
     fields: tuple[str, ...] = ()
     figures: bool = True
     state: str = ''
-    tacholess: Tacholess | None = None
 
 
 @dataclass(frozen=True)
@@ -205,22 +199,16 @@ def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
     cannot be written.
     """
     try:
-        settings = _settings(job)
+        machine = job.machine
+        settings = job.settings(
+            version=_VERSION, figures=job.figures, state=job.state, averager=machine.averager,
+            detector=machine.detector, machine=machine.parts, hardware_id=machine.hardware_id)
         done = read_about(Path(job.folder))
         if done is not None and done.get('settings') == settings:
             return Row(**row_values(done['row']))
         return _averaged(job, settings, progress)
     except SaJitterError as error:
         return Row(job.name, job.path, error=str(error))
-
-
-def _settings(job: AverageJob) -> dict[str, Any]:
-    """Return all that decides the files, as values of JSON; raises RecordingError."""
-    return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
-            'figures': job.figures, 'state': job.state, 'options': json_values(job.options),
-            'averager': dict(job.machine.averager), 'hardware_id': job.machine.hardware_id,
-            'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector),
-            'tacholess': job.tacholess and json_values(asdict(job.tacholess))}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:

@@ -37,6 +37,8 @@ from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
+from sa_jitter_ros.tacholess.recording import Tacholess
+
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
 TEMPORARY = '.averages.'  # prefix of folders whose files are not finished
 
@@ -50,11 +52,24 @@ _WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles'
 
 @dataclass(frozen=True)
 class RecordingJob:
-    """One recording to work on: its `name` in the results, its `path`, the folder of its files."""
+    """
+    One recording to work on: its `name` in the results, its `path`, the folder of its files.
+
+    `options` are keywords of `read`. With `tacholess` the pulses are found in the vibration.
+    """
 
     name: str
     path: str
     folder: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    tacholess: Tacholess | None = None
+
+    def settings(self, **others: Any) -> dict[str, Any]:
+        """Return all that decides the files, as values of JSON; raises RecordingError."""
+        found: dict[str, Any] = json_values({
+            'files': stamp(Path(self.path)), 'path': self.path, 'options': self.options,
+            'tacholess': self.tacholess and asdict(self.tacholess), **others})
+        return found
 
 
 @dataclass(frozen=True)
