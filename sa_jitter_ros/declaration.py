@@ -24,9 +24,9 @@ from typing import Any
 
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
-from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
+from sa_jitter_ros.errors import ModelError, one_line, ParameterError, SaJitterError
 from sa_jitter_ros.machine import following, Machine, PREFIX, UNKNOWN
-from sa_jitter_ros.parameter_file import one_line, read_parameters
+from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.parameters import (
     converted, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
     TRIGGER_CYCLES, unknown_names)

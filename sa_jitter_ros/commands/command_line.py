@@ -24,7 +24,7 @@ from typing import Any, NoReturn, TypeVar
 import warnings
 
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, one_line, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.lifetime import in_main_thread
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.settings import AVERAGER, section
@@ -95,7 +95,7 @@ def run_to_end(run: Callable[[argparse.Namespace, Progress], Found],
                      'another folder; what was finished stays' if error.strerror else str(error))
         return 2
     except SaJitterError as error:
-        progress.say(' '.join(str(error).split()))
+        progress.say(one_line(error))
         return 2
     except KeyboardInterrupt:
         progress.say(stopped)
@@ -137,8 +137,7 @@ def plain_warnings(program: str) -> Iterator[None]:
             yield
         finally:
             for item in caught:
-                print(f'{program}: warning: {" ".join(str(item.message).split())}',
-                      file=sys.stderr)
+                print(f'{program}: warning: {one_line(item.message)}', file=sys.stderr)
 
 
 def require_writable(folder: Path) -> None:

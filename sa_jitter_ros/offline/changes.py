@@ -36,6 +36,7 @@ from sa_jitter_ros.offline.files import read_averages, Signals, waveforms
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.offline.settings import section
 from sa_jitter_ros.parameter_file import value_of
+from sa_jitter_ros.parameters import listed
 
 CHANGES, FIGURE = 'changes.json', 'changes.png'
 MONITOR = 'change_monitor'
@@ -194,8 +195,8 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings,
     usual, _ = Counter(item.channels for item in recorded).most_common(1)[0]
     for item in recorded:
         if item.channels != usual:
-            left_out[item.name] = (f'has the channels {_listed(item.channels)}, most have '
-                                   f'{_listed(usual)}')
+            left_out[item.name] = (f'has the channels {listed(item.channels)}, most have '
+                                   f'{listed(usual)}')
     recorded = [item for item in recorded if item.name not in left_out]
     apart = _in_time(recorded)
     recorded = apart or recorded
@@ -276,10 +277,6 @@ def _recorded(output: Path, name: str, signals: Signals, series: Sequence[ShaftS
         math.nan if first is None else first.header.mean_trigger_speed, channels, means,
         units, names, math.nan if first is None else first.state, discarded,
         refusal if first is None else '' if channels else f'has no channel beside {state}')
-
-
-def _listed(channels: Sequence[int]) -> str:
-    return ', '.join(map(str, channels))
 
 
 def _in_time(recorded: Sequence[Recorded]) -> list[Recorded]:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, one_line, ParameterError, SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.machine import Machine
@@ -97,7 +97,7 @@ def loop_file(job: LoopJob) -> LoopRow:
     except SaJitterError as error:
         return LoopRow(job.name, job.path, error=str(error))
     loop.write(job.folder)
-    row = _row(job, loop, tuple(' '.join(str(item.message).split()) for item in caught))
+    row = _row(job, loop, tuple(one_line(item.message) for item in caught))
     done.write_text(json.dumps(json_values({'settings': settings, 'row': asdict(row)}), indent=1,
                                allow_nan=False) + '\n', encoding='utf-8')
     return row

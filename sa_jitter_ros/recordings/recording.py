@@ -19,7 +19,7 @@ from typing import Protocol
 
 import numpy as np
 from sa_jitter_ros.arrays import Array, FloatArray
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.errors import one_line, RecordingError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
@@ -318,17 +318,11 @@ def recording_errors(path: str | Path) -> Iterator[None]:
     except RecordingError as error:
         if str(error).startswith(place):
             raise
-        raise RecordingError(f'{place}{_line(error)}') from error
+        raise RecordingError(f'{place}{one_line(error)}') from error
     except Exception as error:
-        reason = _line(error) or 'no reason given'
+        reason = one_line(error) or 'no reason given'
         raise RecordingError(
             f'{place}cannot be read ({type(error).__name__}: {reason})') from error
-
-
-def _line(error: Exception) -> str:
-    """Return the message of an error, which may quote the file, as one line of limited length."""
-    text = ' '.join(str(error).split())
-    return text if len(text) <= 500 else f'{text[:500]} ...'
 
 
 def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[FloatArray]:
