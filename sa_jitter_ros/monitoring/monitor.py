@@ -28,7 +28,7 @@ from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
 from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
-from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.parameters import fixed, Parameter, Values
 from scipy import special
 
 
@@ -45,20 +45,18 @@ _FARTHEST = 4.0
 PARAMETERS = (
     Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of all '
               'tests together', above=0.0, maximum=1e4),
-    Parameter('learning_averages', 200, 'averages that a bin learns before it tests, at least '
-              f'{LEAST_LEARNED} groups', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
-    Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
-              maximum=10000, read_only=True),
+    fixed('learning_averages', 200, 'averages that a bin learns before it tests, at least '
+          f'{LEAST_LEARNED} groups', minimum=LEAST_LEARNED, maximum=10000000),
+    fixed('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
+          maximum=10000),
     Parameter('allow_uncorrected', False, 'take raw values without a correction; another '
               'keyphasor is then a change'),
-    Parameter('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
-              minimum=1e-4, maximum=1.0, read_only=True),
-    Parameter('state_bin', 0.0, 'width of a bin of the operating state; 0: one for all',
-              minimum=0.0, read_only=True),
-    Parameter('state_lowest', math.nan, 'averages at lower operating states are discarded; NaN: '
-              'none', read_only=True),
-    Parameter('state_highest', math.nan, 'averages at higher operating states are discarded; NaN: '
-              'none', read_only=True),
+    fixed('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
+          minimum=1e-4, maximum=1.0),
+    fixed('state_bin', 0.0, 'width of a bin of the operating state; 0: one for all', minimum=0.0),
+    fixed('state_lowest', math.nan, 'averages at lower operating states are discarded; NaN: none'),
+    fixed('state_highest', math.nan, 'averages at higher operating states are discarded; NaN: '
+          'none'),
 )
 
 

@@ -30,7 +30,7 @@ from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, decode_residual, PREDICTION_FIELDS,
     RESIDUAL_FIELDS)
 from sa_jitter_ros.nodes.result_flows import AVERAGE, ResultFlows
-from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
+from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
 
 LARGEST_REPORT = 1_000_000  # characters of a text in JSON
@@ -40,12 +40,11 @@ KINDS = ('synchronous_average', 'standard_error', 'corrected_average', AVERAGE, 
 NODES, NODE_VALUES = 64, 100  # nodes whose diagnostics are shown, and values of each node
 
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
-    Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
-    Parameter('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
-              maximum=65535, read_only=True),
-    Parameter('open_to_network', False, 'allow a host that others reach, who then see '
-              'everything', read_only=True),
+    fixed('shafts', ['shaft'], 'names of the shafts'),
+    fixed('host', '127.0.0.1', 'address to listen on'),
+    fixed('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
+          maximum=65535),
+    fixed('open_to_network', False, 'allow a host that others reach, who then see everything'),
     Parameter('vibration_unit', '', 'unit of the vibration on labels; empty: that of '
               'machine.channels'),
     Parameter('channel_names', [], 'names of the channels on labels; empty: those of '

@@ -22,7 +22,7 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import fixed, Parameter
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import usable_channels
 from sa_jitter_ros.recordings.channel_units import in_units, scale_of
@@ -32,18 +32,17 @@ from sa_jitter_ros.samples import SampleBlock
 
 
 PARAMETERS = (
-    Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
+    fixed('recording', '', 'file or rosbag2 folder to play'),
     Parameter('loop', False, 'start again at the end; times and indices continue'),
-    Parameter('tach', 'auto', 'keyphasor to play; both: pulses and waveform; auto: the first of '
-              'pulses, waveform, reference',
-              choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'), read_only=True),
-    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: as '
-              'recorded', unit='Hz', minimum=0.0, read_only=True),
-    Parameter('recorded_keyphasor', '', 'keyphasor to play, of several in a bag; empty: the first',
-              read_only=True),
+    fixed('tach', 'auto', 'keyphasor to play; both: pulses and waveform; auto: the first of '
+          'pulses, waveform, reference',
+          choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none')),
+    fixed('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: as recorded',
+          unit='Hz', minimum=0.0),
+    fixed('recorded_keyphasor', '', 'keyphasor to play, of several in a bag; empty: the first'),
     *READ_PARAMETERS,
-    Parameter('fields', [], 'NAME=KEY: the key that the file has for a field; or NAME=VALUE',
-              element=str, read_only=True),
+    fixed('fields', [], 'NAME=KEY: the key that the file has for a field; or NAME=VALUE',
+          element=str),
 )
 
 

@@ -38,7 +38,7 @@ from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode
                                           encode_residual, ResidualMessage)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name
 from sa_jitter_ros.nodes.result_flows import ResultFlows
-from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
+from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
 from std_msgs.msg import Float64MultiArray, String
@@ -48,9 +48,9 @@ Found = TypeVar('Found')
 Waiting = Generator[None, None, Found]
 
 PARAMETERS = (
-    Parameter('shaft', 'shaft', 'shaft whose averages are compared', read_only=True),
-    Parameter('predictor', 'jitter_predictor', 'node whose predictions are compared and whose '
-              'effects are set', read_only=True),
+    fixed('shaft', 'shaft', 'shaft whose averages are compared'),
+    fixed('predictor', 'jitter_predictor', 'node whose predictions are compared and whose effects '
+          'are set'),
     Parameter('acquisitions', 20, 'averages compared at once; at least 4 to find a missing effect',
               minimum=2, maximum=10000),
     Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),

@@ -26,7 +26,7 @@ from sa_jitter_ros.nodes.joint_input import JointInput
 from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES
 from sa_jitter_ros.nodes.signals import PulseOutput, SampleInput
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, sample_parameters, TACH_TYPE, Values)
+    fixed, Parameter, PULSES_PER_REVOLUTION, sample_parameters, TACH_TYPE, Values)
 from sa_jitter_ros.pulses.detector_parameters import DECISIVE, detector_of, DETECTOR_PARAMETERS
 from sensor_msgs.msg import JointState
 
@@ -42,15 +42,12 @@ JOINT_TYPE = 'sensor_msgs/JointState'
 PARAMETERS = (
     *sample_parameters('tach_waveform'),
     TACH_TYPE,
-    Parameter('tach_waveform_type', '', 'message type of tach_waveform; empty: that of '
-              f'vibration_type; {JOINT_TYPE}: its positions (rad) give the pulses',
-              read_only=True),
-    Parameter('joint', '', f'joint of {JOINT_TYPE} to follow; '
-              'empty: the only one', read_only=True),
+    fixed('tach_waveform_type', '', 'message type of tach_waveform; empty: that of '
+          f'vibration_type; {JOINT_TYPE}: its positions (rad) give the pulses'),
+    fixed('joint', '', f'joint of {JOINT_TYPE} to follow; ' 'empty: the only one'),
     replace(PULSES_PER_REVOLUTION, read_only=True, description='marks on a revolution of the '
             'joint, one at angle 0'),
-    Parameter('imu_axis', 'z', 'axis of linear acceleration',
-              choices=('x', 'y', 'z'), read_only=True),
+    fixed('imu_axis', 'z', 'axis of linear acceleration', choices=('x', 'y', 'z')),
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the pulses'),
     *DETECTOR_PARAMETERS,
 )

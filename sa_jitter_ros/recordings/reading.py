@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Any
 
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import fixed
 from sa_jitter_ros.recordings.bag_format import open_bag
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.channel_units import Channels, channels_of, in_units, PREFIX
@@ -35,15 +35,13 @@ _LISTS = {'.csv': open_csv, '.tdms': open_tdms, '.mf4': open_mdf, '.mdf': open_m
           '.uff': open_uff, '.unv': open_uff}  # what opens files that are lists of channels
 #: Keywords of `read` that commands and the recording player take, too.
 READ_PARAMETERS = (
-    Parameter('acquisition', 0, 'acquisition to read, from 0, of several in a file', minimum=0,
-              read_only=True),
-    Parameter('sample_rate', 0.0, 'sampling rate of the vibration, if not in the file',
-              unit='Hz', minimum=0.0, read_only=True),
-    Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of '
-              'a bag; empty: all but the tach', element=str, read_only=True),
-    Parameter('tach_channel', '', 'name or number of the tach waveform', read_only=True),
-    Parameter('time_column', '', 'name or number of the column of times in a .csv',
-              read_only=True),
+    fixed('acquisition', 0, 'acquisition to read, from 0, of several in a file', minimum=0),
+    fixed('sample_rate', 0.0, 'sampling rate of the vibration, if not in the file', unit='Hz',
+          minimum=0.0),
+    fixed('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of a '
+          'bag; empty: all but the tach', element=str),
+    fixed('tach_channel', '', 'name or number of the tach waveform'),
+    fixed('time_column', '', 'name or number of the column of times in a .csv'),
 )
 SUFFIXES = ('.npz', '.mat', '.wav', *_LISTS, '.mcap', '.db3')
 
