@@ -22,9 +22,8 @@ from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
-from sa_jitter_ros.nodes.joint_input import JointInput
 from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES
-from sa_jitter_ros.nodes.signals import PulseOutput, SampleInput
+from sa_jitter_ros.nodes.signals import JointInput, PulseOutput, SampleInput
 from sa_jitter_ros.parameters import (
     fixed, Parameter, PULSES_PER_REVOLUTION, sample_parameters, TACH_TYPE, Values)
 from sa_jitter_ros.pulses.detector_parameters import DECISIVE, detector_of, DETECTOR_PARAMETERS

@@ -25,7 +25,8 @@ from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, write_averages)
+    finished_together, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals,
+    TABLE, write_averages, write_rows)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -41,7 +42,7 @@ from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 
-FOUND = 'found_pulses.npz'
+FOUND, RECORDINGS = 'found_pulses.npz', 'recordings.csv'
 _VERSION = 5  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
@@ -279,3 +280,15 @@ def _counted(row: Row, averager: RecordingAverager, series: list[ShaftSeries]) -
         trigger_cycles=averager.stream.counts.cycles, corrections_refused=averager.refused,
         cycles_dropped=totals['cycles_dropped'], pulses_dropped=totals['pulses_dropped'],
         samples_dropped=totals['samples_dropped'], gaps=totals['gaps'])
+
+
+def write_tables(output: Path, rows: Sequence[Row]) -> None:
+    """
+    Write `averages.csv` and `recordings.csv` beside the folders of the recordings.
+
+    A recording that ended early, or could not be averaged, has a row with the reason in both.
+    Raises OSError.
+    """
+    ordered = write_rows(output / RECORDINGS, rows)
+    join_tables(output / TABLE, [output / row.recording for row in ordered if row.averages],
+                [(row.recording, row.error) for row in ordered if row.error])

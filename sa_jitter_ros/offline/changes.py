@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import KINDS, mean_of, monitored, MonitoredAverage
-from sa_jitter_ros.offline.files import read_averages, Signals, waveforms
+from sa_jitter_ros.offline.files import read_averages, Signals, waveforms, write_lines
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.offline.settings import section
 from sa_jitter_ros.parameter_file import value_of
@@ -117,6 +118,14 @@ class Changes:
             'recordings': [item.name for item in self.recordings],
             'left_out': dict(self.left_out)})
         return found
+
+    def write(self, output: Path, *, figure: bool) -> None:
+        """Write `changes.json`, and `changes.png` with a `figure`; raises OSError."""
+        text = json.dumps(self.report(), indent=1, allow_nan=False)
+        write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
+        if figure:
+            from sa_jitter_ros.offline.change_figure import changes_figure
+            changes_figure(self).savefig(output / FIGURE, dpi=110)
 
     def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
         return {**item.content(), 'channel': self.recordings[0].channels[item.channel],

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES, RawArray
-from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.recording import library
 
 _ROWS_BYTES = 1 << 24
 _MOST_CELLS = 10_000

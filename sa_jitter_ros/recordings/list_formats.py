@@ -30,9 +30,8 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import MAX_VALUES
-from sa_jitter_ros.recordings.recording import Recording
+from sa_jitter_ros.recordings.recording import library, Recording
 
 _FUNCTION, _GENERAL, _TIME_RESPONSE = 58, 0, 1
 _DIRECTIONS = {1: '+X', 2: '+Y', 3: '+Z', -1: '-X', -2: '-Y', -3: '-Z'}

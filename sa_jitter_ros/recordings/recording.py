@@ -325,6 +325,26 @@ def recording_errors(path: str | Path) -> Iterator[None]:
             f'{place}cannot be read ({type(error).__name__}: {reason})') from error
 
 
+@contextmanager
+def library(reads: str, name: str, extra: str, otherwise: str = '') -> Iterator[None]:
+    """
+    Raise RecordingError that says how to install a library if an import within it fails.
+
+    `reads` is what it reads, `extra` the one of this package that installs it.
+
+    >>> with library('bags are', 'rosbags', 'bags'):  # doctest: +ELLIPSIS
+    ...     import no_such
+    Traceback (most recent call last):
+    ...
+    sa_jitter_ros.errors.RecordingError: bags are read with rosbags, which is not installed: ...
+    """
+    try:
+        yield
+    except ImportError:
+        raise RecordingError(f'{reads} read with {name}, which is not installed: pip install '
+                             f"'sa_jitter_ros[{extra}]' or {name}{otherwise}") from None
+
+
 def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[FloatArray]:
     """Cut `channel` x `sample` pieces of any length into blocks of one length."""
     held: list[FloatArray] = []
