@@ -93,9 +93,8 @@ class Declaration:
         return next(iter(self.models.values()))
 
 
-def predictor_parameters(
-    shafts: Sequence[str] = ('shaft',), given: Collection[str] = (),
-) -> tuple[Parameter, ...]:
+def predictor_parameters(shafts: Sequence[str] = ('shaft',), given: Collection[str] = ()
+                         ) -> tuple[Parameter, ...]:
     """
     Return the parameters of `jitter_predictor` for these shafts.
 

@@ -253,9 +253,8 @@ def draw_leakage(axes: Axes, remaining: Leakage) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_detection(
-    axes: Axes, found: Design, detection: np.ndarray, options: argparse.Namespace,
-) -> None:
+def draw_detection(axes: Axes, found: Design, detection: np.ndarray, options: argparse.Namespace
+                   ) -> None:
     """Draw the probability of detection over the size of the change."""
     changes = np.linspace(0.0, 2.0 * options.change, _CHANGES)
     changes = changes[changes >= -1.0]

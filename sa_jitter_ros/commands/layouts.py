@@ -29,8 +29,7 @@ from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader
 from sa_jitter_ros.commands.command_line import Parser, run_to_end, show
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE as PREDICTOR, read_declaration
-from sa_jitter_ros.nodes.messages import (
-    PREDICTION_FIELDS, PredictionMessage, ResidualMessage)
+from sa_jitter_ros.nodes.messages import PREDICTION_FIELDS, PredictionMessage, ResidualMessage
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.settings import AVERAGER, MachineFile
 from sa_jitter_ros.parameter_file import named_parameters, read_parameters

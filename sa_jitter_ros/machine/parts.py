@@ -9,7 +9,7 @@
 # the License.
 
 """
-The parts of a machine, and the orders at which each shows.
+The parts of a machine, the orders at which each shows, and limits by the names of the parts.
 
 Orders of a part are multiples of the speed of a shaft that it is on.
 """
@@ -31,6 +31,8 @@ _TEETH = Parameter('teeth', 0, 'number of teeth', minimum=_FEWEST_TEETH, maximum
 _SHAFT = Parameter('shaft', '', 'name of a shaft')
 _LENGTH = Parameter('length', 0.0, 'a length', unit='m', above=0.0)
 _ORDER = Parameter('order', 0.0, 'a multiple of the speed of the shaft', above=0.0)
+LEVELS = ('warn', 'alarm')
+_OF = ('order', 'part', 'indicator')
 
 
 class Part:
@@ -301,3 +303,51 @@ class Bearing(Part):
             found['2x ball'] = 2.0 * found['ball']
         return {f'bearing {name} {part}': order for part, order in found.items()
                 if order is not None}
+
+
+@dataclass(frozen=True)
+class Limit(Part):
+    """
+    A limit of an order, of what a part of the machine makes, or of a condition indicator.
+
+    `warn` and `alarm` are in the unit of the channel, `relative` ones times the baseline. Without
+    `channel`, a name or a number, all are meant; without `shaft` the only one that has it.
+    """
+
+    order: float | None = None
+    part: str | None = None
+    indicator: str | None = None
+    shaft: str | None = None
+    channel: str | None = None
+    warn: float | None = None
+    alarm: float | None = None
+    relative: bool | None = None
+    KINDS: ClassVar = {
+        'order': _ORDER,
+        **{name: Parameter(name, '', f'name of a {name}')
+           for name in ('part', 'indicator', 'shaft', 'channel')},
+        **{name: Parameter(name, 0.0, 'a limit', above=0.0) for name in LEVELS},
+        'relative': Parameter('relative', False, 'times the baseline')}
+
+    def check(self, place: str) -> None:
+        """Check the values; raises ParameterError, which names the place in the file."""
+        super().check(place)
+        given = [name for name in _OF if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ParameterError(f'{place} gives {" and ".join(given) or "no quantity"}: give one '
+                                 f'of {", ".join(_OF)}')
+        bounds = [*self.bounds.values()]
+        if not bounds:
+            raise ParameterError(f'{place} has neither warn nor alarm: give one, or both')
+        if bounds[0] > bounds[-1]:
+            raise ParameterError(f'{place}.warn is {self.warn:g}, above its alarm of '
+                                 f'{self.alarm:g}: a warning comes first; are they swapped?')
+        if self.relative and bounds[0] <= 1.0:
+            raise ParameterError(f'{place} is relative and {bounds[0]:g}: give times the '
+                                 'baseline, more than 1')
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """Return the bounds that are given, by level."""
+        return {level: value for level, value in zip(LEVELS, (self.warn, self.alarm))
+                if value is not None}

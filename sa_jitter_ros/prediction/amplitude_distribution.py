@@ -282,9 +282,8 @@ def _chord(offset: Array, center: Array, mean: Array, std: Array, skew: Array | 
     return np.where(some, off, 0.0), np.where(some, weight, point)
 
 
-def _quantile_bracket(
-    mean: Array, variance: Array, probability: ArrayLike,
-) -> tuple[Array, Array, Array]:
+def _quantile_bracket(mean: Array, variance: Array, probability: ArrayLike
+                      ) -> tuple[Array, Array, Array]:
     """
     Return probabilities (k,) and bounds (orders, k) of their quantiles, by Cantelli's inequality.
 

@@ -87,10 +87,8 @@ class Amplitudes:
     draws: Array | None = field(default=None, repr=False)
     noise: Array | None = field(default=None, repr=False)
 
-    def distribution(
-        self, order: ArrayLike, *, shift: ArrayLike = 0.0, noise: ArrayLike = 0.0,
-        most: int | None = None,
-    ) -> AmplitudeDistribution | SampledDistribution:
+    def distribution(self, order: ArrayLike, *, shift: ArrayLike = 0.0, noise: ArrayLike = 0.0,
+                     most: int | None = None) -> AmplitudeDistribution | SampledDistribution:
         """
         Return the distribution of abs(X + shift + n) over all scenarios, one entry per row.
 
@@ -113,10 +111,8 @@ class Amplitudes:
         moments = self.moments.of((rows,)).shifted(shift).with_noise(noise)
         return SampledDistribution(center, values - center[:, None], moments.mean_square)
 
-    def distribution_in(
-        self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
-        noise: ArrayLike = 0.0,
-    ) -> AmplitudeDistribution | SampledDistribution:
+    def distribution_in(self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
+                        noise: ArrayLike = 0.0) -> AmplitudeDistribution | SampledDistribution:
         """Return the same for rows that are in a scenario each; `scenario` (row,) are indices."""
         rows = np.asarray(scenario), np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)

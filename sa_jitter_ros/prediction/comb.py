@@ -127,10 +127,8 @@ def waveform_share(tone_orders: ArrayLike, length: float) -> Array:
                                    for count in (most, fewest))))
 
 
-def leakage(
-    interfering_orders: ArrayLike, orders: ArrayLike, *, cycle_length: float, minimum: int,
-    maximum: int, trigger_cycles: int | None = None,
-) -> Leakage:
+def leakage(interfering_orders: ArrayLike, orders: ArrayLike, *, cycle_length: float, minimum: int,
+            maximum: int, trigger_cycles: int | None = None) -> Leakage:
     """
     Return what an average keeps of interfering orders, and choose its number of trigger cycles.
 

@@ -30,11 +30,7 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import (
-    angle_spread,
-    AngleErrorProcess,
-    joint_characteristic,
-    unit_nodes,
-)
+    angle_spread, AngleErrorProcess, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import is_number
 
 
@@ -114,10 +110,8 @@ class CycleMoments:
                               weight @ self.pseudo_variance[lags])
 
 
-def cycle_moments(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, nodes: int = NODES,
-    lags: int | None = None,
-) -> CycleMoments:
+def cycle_moments(orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, nodes: int = NODES,
+                  lags: int | None = None) -> CycleMoments:
     """
     Return the exact moments of single trigger cycles for orders of shape (n,).
 

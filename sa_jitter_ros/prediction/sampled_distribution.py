@@ -148,9 +148,8 @@ class SampledDistribution:
             values, np.clip(index, 0, count - 1), axis=1))
 
 
-def can_be_sampled(
-    processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int,
-) -> bool:
+def can_be_sampled(processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int
+                   ) -> bool:
     """Return whether averages of all processes can be drawn, and in about a second."""
     pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
     points = trigger_cycles * (1 if pulsed else _PLACES)
@@ -161,11 +160,9 @@ def can_be_sampled(
         for process in processes)
 
 
-def drawn_averages(
-    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
-    weights: PulseWeights = LINEAR, known: KnownErrors | None = None, each: Array | None = None,
-    spread: float = 0.0,
-) -> tuple[Array, Array]:
+def drawn_averages(orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
+                   weights: PulseWeights = LINEAR, known: KnownErrors | None = None,
+                   each: Array | None = None, spread: float = 0.0) -> tuple[Array, Array]:
     """
     Return X - 1 (order, draw) of averages of `trigger_cycles` cycles, and noise, E|n|^2 1.
 

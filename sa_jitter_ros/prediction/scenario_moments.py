@@ -26,9 +26,8 @@ _STEEP = 0.5  # fundamental cycles within a cycle: there a pulse is missing
 _BLOCK = 1_000_000  # phasors held at once
 
 
-def scenario_moments(
-    model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
-) -> AverageMoments:
+def scenario_moments(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array
+                     ) -> AverageMoments:
     """
     Return the moments (scenario, order) of averages with known pulse `errors` (scenario, n).
 

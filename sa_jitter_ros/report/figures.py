@@ -27,8 +27,7 @@ from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.number_text import HALF_95, order_text
 from sa_jitter_ros.report import evidence_figures
-from sa_jitter_ros.report.plotting import (
-    AFTER, arrange, BEFORE, MEASURED, panels, with_effects)
+from sa_jitter_ros.report.plotting import AFTER, arrange, BEFORE, MEASURED, panels, with_effects
 
 
 _FEWEST_CYCLES = 3
