@@ -24,17 +24,17 @@ from typing import Any
 
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
-from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
+from sa_jitter_ros.errors import ModelError, one_line, ParameterError, SaJitterError
 from sa_jitter_ros.machine import following, Machine, PREFIX, UNKNOWN
-from sa_jitter_ros.parameter_file import one_line, read_parameters
+from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.parameters import (
-    converted, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
-    TRIGGER_CYCLES, unknown_names)
+    converted, fixed, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO,
+    require_shaft_names, TRIGGER_CYCLES, unknown_names)
 from sa_jitter_ros.prediction.model import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
 NODE = 'jitter_predictor'
-SHAFTS = Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True)
+SHAFTS = fixed('shafts', ['shaft'], 'names of the shafts')
 #: Parameters of each shaft.
 SHAFT_PARAMETERS = (
     RATIO,
@@ -93,9 +93,8 @@ class Declaration:
         return next(iter(self.models.values()))
 
 
-def predictor_parameters(
-    shafts: Sequence[str] = ('shaft',), given: Collection[str] = (),
-) -> tuple[Parameter, ...]:
+def predictor_parameters(shafts: Sequence[str] = ('shaft',), given: Collection[str] = ()
+                         ) -> tuple[Parameter, ...]:
     """
     Return the parameters of `jitter_predictor` for these shafts.
 

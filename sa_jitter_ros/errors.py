@@ -14,6 +14,8 @@ Errors that the package raises for bad input.
 Every message states the value, the limit and the remedy.
 """
 
+_LONGEST = 300  # characters of a line that quotes a file
+
 
 class SaJitterError(ValueError):
     """
@@ -107,3 +109,9 @@ class DataWarning(UserWarning):
     >>> [average.trigger_cycles for average in averages]
     [19, 9, 17]
     """
+
+
+def one_line(message: object) -> str:
+    """Return the text of an error, which may quote a file, as one line of limited length."""
+    text = ' '.join(str(message).split())
+    return text if len(text) <= _LONGEST else f'{text[:_LONGEST]} ...'

@@ -26,6 +26,7 @@ import tempfile
 from typing import Any
 import warnings
 
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.effects import declared_effects
 from sa_jitter_ros.errors import DataWarning, ModelError, SaJitterError
@@ -37,7 +38,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
-from sa_jitter_ros.recordings.recording import FloatArray
 from sa_jitter_ros.report.report import parameters_text, report, summary
 
 Source = str | os.PathLike[str] | Recording

@@ -18,7 +18,7 @@ import stat
 from types import MappingProxyType
 from typing import Any
 
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.errors import one_line, ParameterError
 import yaml
 
 _LARGEST_FILE = 1 << 20
@@ -146,12 +146,6 @@ def require_regular_file(path: Path) -> None:
     if found.st_size > _LARGEST_FILE:
         raise ParameterError(f'{found.st_size} bytes are too many for a parameter file: give at '
                              f'most {_LARGEST_FILE}')
-
-
-def one_line(error: Exception) -> str:
-    """Return the text of an error, which may quote a file, as one line of limited length."""
-    text = ' '.join(str(error).split())
-    return text if len(text) <= 300 else f'{text[:300]} ...'
 
 
 def _check_structure(text: str) -> None:

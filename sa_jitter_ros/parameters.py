@@ -17,6 +17,7 @@ A `Parameter` converts and checks values; `nodes/parameters.py` declares it to R
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 import math
 from numbers import Integral, Real
 import re
@@ -112,6 +113,10 @@ class Parameter:
             raise ParameterError(f'{name} is {given}{unit}: give {limit}')
 
 
+#: A parameter that is fixed when the node starts.
+fixed = partial(Parameter, read_only=True)
+
+
 def _is_a(kind: Any, value: Any) -> bool:
     """Return whether a value is a number of a kind; true and false are not."""
     return isinstance(value, kind) and not isinstance(value, bool)
@@ -183,9 +188,8 @@ PULSES_PER_TRIGGER = Parameter(
     maximum=100000)
 TRIGGER_CYCLES = Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
                            maximum=1000000)
-TACH_TYPE = Parameter(
-    'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; '
-    'std_msgs/Float64MultiArray for more than some hundred pulses a second', read_only=True)
+TACH_TYPE = fixed('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; '
+                  'std_msgs/Float64MultiArray for more than some hundred pulses a second')
 #: Of every node, and of every node that takes data.
 HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine in diagnostics; empty: that of '
                         'this computer')
@@ -211,14 +215,12 @@ def unknown_names(values: Mapping[str, Any], known: Mapping[str, Parameter]) -> 
 def sample_parameters(topic: str) -> tuple[Parameter, ...]:
     """Return the parameters of the node whose input of samples is `topic`."""
     return (
-        Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
-                  read_only=True),
-        Parameter('sample_rate', 0.0, 'sampling rate, if not in the messages',
-                  unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
-        Parameter('start_time', 0.0, 'time of the first sample, if not in the messages',
-                  unit='s', read_only=True),
-        Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
-                  unit='s', above=0.0, read_only=True),
+        fixed('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}'),
+        fixed('sample_rate', 0.0, 'sampling rate, if not in the messages', unit='Hz', minimum=0.0,
+              maximum=1e9),
+        fixed('start_time', 0.0, 'time of the first sample, if not in the messages', unit='s'),
+        fixed('time_tolerance', 0.01, 'deviation of a header time that starts a new run', unit='s',
+              above=0.0),
     )
 
 

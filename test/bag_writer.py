@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.message_layouts import encode_time, INDEX_BASE
-from sa_jitter_ros.recordings.recording import FloatArray, Recording
+from sa_jitter_ros.recordings.recording import Recording
 
 FLOAT64 = 'std_msgs/msg/Float64MultiArray'
 FLOAT32 = 'std_msgs/msg/Float32MultiArray'

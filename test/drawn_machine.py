@@ -16,7 +16,7 @@ import numpy as np
 from sa_jitter_ros.averaging.results import (
     AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS)
 from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor
-from sa_jitter_ros.monitoring.quantities import monitored
+from sa_jitter_ros.monitoring.quantities import KINDS, monitored
 
 ORDERS, LEVELS = (1.0, 19.0, 38.0), np.array([0.2, 1.0, 0.5])
 NAMES, INDICATORS = ('rms', 'kurtosis', 'm8a'), np.array([0.8, 1.8, 100.0])
@@ -78,7 +78,7 @@ class DrawnMachine:
 
     def average(self):
         """Return what is monitored of the next average."""
-        return monitored(*self.messages())
+        return monitored(dict(zip(KINDS, self.messages())))
 
     def monitor(self, **changes):
         """Return a new monitor."""

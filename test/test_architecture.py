@@ -24,8 +24,9 @@ PACKAGE = ROOT / 'sa_jitter_ros'
 MODULES = sorted(PACKAGE.rglob('*.py'))
 
 # What each room may import: third-party packages and other rooms. `` is the library itself.
-SCIENCE = {'numpy', 'scipy'}
+SCIENCE = {'arrays', 'numpy', 'scipy'}
 CORE = {
+    'arrays': {'numpy'},
     'errors': set(),
     'html_parts': set(),
     'inner_loops': SCIENCE,
@@ -66,7 +67,7 @@ CORE = {
         'averaging', 'effects', 'errors', 'html_parts', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
     'loop': {
-        'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
+        'arrays', 'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
         'pulses', 'recordings', 'report'},
 }
 ROOMS = {

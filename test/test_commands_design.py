@@ -167,5 +167,5 @@ def test_it_runs_as_a_process_and_explains_units(tmp_path):
         [sys.executable, '-m', 'sa_jitter_ros.commands.design', '--help'], cwd=tmp_path,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, capture_output=True,
         text=True, check=True)
-    for word in ('Hz', 'fraction', "units of the component's amplitude", 'examples:'):
+    for word in ('Hz', 'fraction', 'of components of amplitude 1', 'examples:'):
         assert word in ' '.join(result.stdout.split())

@@ -138,7 +138,7 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
         assert read_declaration(file).models
         return
     row = average_file(AverageJob(name, str(path), str(tmp_path / 'averages'),
-                                  MachineFile.read(file), options=fields, figures=False))
+                                  machine=MachineFile.read(file), options=fields, figures=False))
     assert (row.error, row.averages > 0) == ('', True)
     for model in read_declaration(file, sample_rate=recording.sample_rate).models.values():
         record_pulses(recording, model)

@@ -25,9 +25,9 @@ from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
 from sa_jitter_ros.monitoring.change_test import ChangeTest
 from sa_jitter_ros.monitoring.evidence import ChangeEvidence, threshold
-from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
+from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Settings, YEAR
-from sa_jitter_ros.monitoring.quantities import monitored
+from sa_jitter_ros.monitoring.quantities import KINDS, monitored
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
 
 # --- false alarms --------------------------------------------------------------------------------
@@ -311,7 +311,8 @@ def test_missing_numbers_cost_themselves_alone():
         if number == 500:
             machine.gain[0, 1] = 1.1
         absent = number % 7 == 0
-        lines = monitor.update(monitored(orders, indicators, None if absent else errors))
+        arrays = dict(zip(KINDS, (orders, indicators, errors)[:2 if absent else 3]))
+        lines = monitor.update(monitored(arrays))
         assert all('order 19 of input, channel 0' in line for line in lines)
     found, = monitor.changes()
     assert found.change == pytest.approx(0.1, abs=4.0 * found.standard_error)
@@ -423,11 +424,12 @@ def test_bearing_orders_that_the_baseline_lacks_are_refused():
     machine = Machine(19)
     orders, indicators, errors, envelope = machine.messages()
     monitor = MachineMonitor('pump 3', ['input'], SETTINGS)
-    monitor.take_average('input', monitored(orders, indicators, errors))
+    monitor.take_average('input', monitored(dict(zip(KINDS, (orders, indicators, errors)))))
     with pytest.raises(ParameterError, match=r'3 indicators, bearing orders 4\.9, its baseline'):
         monitor.take_average('input', machine.average())
     with pytest.raises(MessageError, match='1 channels of the envelope and 2 of orders'):
-        monitored(orders, indicators, errors, replace(envelope, values=envelope.values[:1]))
+        monitored(dict(zip(KINDS, (
+            orders, indicators, errors, replace(envelope, values=envelope.values[:1])))))
 
 
 def test_average_without_indicators_keeps_none_waiting():
@@ -442,7 +444,8 @@ def test_average_without_indicators_keeps_none_waiting():
 def test_arrays_that_do_not_fit_are_refused():
     orders, indicators, errors, _ = Machine(12).messages()
     with pytest.raises(MessageError, match='1 channels of indicators and 2 of orders'):
-        monitored(orders, replace(indicators, values=indicators.values[:1]), errors)
+        monitored(dict(zip(KINDS, (
+            orders, replace(indicators, values=indicators.values[:1]), errors))))
     with pytest.raises(ParameterError, match='learn at least 8 groups, 40 averages'):
         Settings(learning_averages=39)
     with pytest.raises(ParameterError, match='learning is 3 values: give at least 8'):
@@ -544,7 +547,7 @@ def test_baseline_of_another_machine_is_refused(kept):
     orders, indicators, errors, _ = machine.messages()
     orders.values[..., 0] += 1.0
     with pytest.raises(ParameterError, match=r'orders 2, 20, 39 .* another machine'):
-        monitor.update(monitored(orders, indicators, errors))
+        monitor.update(monitored(dict(zip(KINDS, (orders, indicators, errors)))))
     assert len(read_baseline(path, 'pump 3', replace(SETTINGS, false_alarms_per_year=5.0))) == 1
 
 

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.monitoring.baseline_file import lock_baseline
-from sa_jitter_ros.monitoring.machine_monitor import KINDS
+from sa_jitter_ros.monitoring.quantities import KINDS
 from sa_jitter_ros.nodes import health, messages
 from sa_jitter_ros.nodes.change_monitor import baseline_path, ChangeMonitor
 from sa_jitter_ros.nodes.testing import Graph

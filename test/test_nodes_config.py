@@ -28,8 +28,8 @@ from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
+from sa_jitter_ros.nodes.parameters import given_parameters
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
-from sa_jitter_ros.nodes.renaming import given_parameters
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sa_jitter_ros.nodes.tach_detector import TachDetector

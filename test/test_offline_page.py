@@ -56,7 +56,7 @@ def folder(tmp_path_factory):
     (place / 'machine.yaml').write_text(MACHINE)
     row = average_file(AverageJob(
         'rig', str(place / 'rig.npz'), str(place / 'out'),
-        MachineFile.read(place / 'machine.yaml'), figures=False))
+        machine=MachineFile.read(place / 'machine.yaml'), figures=False))
     assert row.averages == 4
     write_page(place / 'out')
     return place / 'out'
@@ -134,8 +134,8 @@ def test_a_page_prints_on_any_paper(folder):
 
 def test_recordings_without_correction_bearings_and_machine_have_a_page(folder, tmp_path):
     row = average_file(AverageJob(
-        'plain', str(folder.parent / 'rig.npz'), str(tmp_path), MachineFile.read(
-            None, ['trigger_cycles:=40', 'correct_jitter:=false']), figures=False))
+        'plain', str(folder.parent / 'rig.npz'), str(tmp_path), figures=False,
+        machine=MachineFile.read(None, ['trigger_cycles:=40', 'correct_jitter:=false'])))
     assert row.averages == 2
     write_page(tmp_path)
     rows = {row[0]: row[1:] for row in Tables((tmp_path / 'page.html').read_text()).rows}

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
+from sa_jitter_ros.prediction.amplitude_distribution import curved_along
 from sa_jitter_ros.prediction.amplitudes import unit_amplitudes
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import average_cumulants, third_cumulants
@@ -44,7 +44,8 @@ def jittered(distribution, order, cycles):
     jitter = [IndependentPulseJitter(distribution)]
     single = cycle_moments([order], jitter)
     moments = single.averaged(cycles)
-    return moments, curved_distribution(moments, *third_cumulants([order], jitter, cycles, single))
+    return moments, curved_along(Parts.about(
+        moments.mean, moments, *third_cumulants([order], jitter, cycles, single)))
 
 
 @pytest.mark.parametrize(('moments', 'tolerance'), [
@@ -127,7 +128,7 @@ def test_bent_averages_keep_their_mean_square_in_noise():
     moments, cumulants = single.averaged(30), third_cumulants([0.4], jitter, 30, single)
     for level in (0.0, 1e-3, 1.0):
         noisy = moments.with_noise(level)
-        distribution = curved_distribution(noisy, *cumulants)
+        distribution = curved_along(Parts.about(noisy.mean, noisy, *cumulants))
         assert distribution.mean_square[0] == pytest.approx(
             moments.mean_square[0] + level, rel=1e-12)
     normal = normal_distribution(noisy)

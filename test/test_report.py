@@ -28,6 +28,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.figures import illustrate
 from sa_jitter_ros.report.html_report import html, report_files
+from sa_jitter_ros.report.plotting import arrange
 from sa_jitter_ros.report.report import report
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 from sa_jitter_ros.simulation import (AdditiveNoise, band_limited, DeclaredJitter, Gearbox,
@@ -240,6 +241,7 @@ def test_panels_are_labelled(traces, verdict):
     figures = illustrate(traces[verdict])
     assert {item.name for item in figures} == NAMES
     for item in figures:
+        arrange(item.figure)
         for axes in item.figure.axes:
             assert axes.get_ylabel(), item.name
             assert axes.get_title() or item.name == 'residual'

@@ -13,11 +13,12 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
+from sa_jitter_ros.prediction.amplitude_distribution import curved_along
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Normal, Triangular, Uniform
 from sa_jitter_ros.prediction.moments import cycle_moments
+from sa_jitter_ros.prediction.parts import Parts
 from scipy import stats
 from validation.analytic import multi_harmonic_moments
 from validation.monte_carlo import AveragedSignal, monte_carlo
@@ -106,8 +107,9 @@ def test_prediction_of_the_distribution_holds_for_other_jitters_ratios_and_stron
         distribution, order, cycles, ratio, noise):
     jitter = [IndependentPulseJitter(distribution)]
     single = cycle_moments([order], jitter)
-    predicted = curved_distribution(single.averaged(cycles).with_noise(noise),
-                                    *third_cumulants([order], jitter, cycles, single))
+    moments = single.averaged(cycles).with_noise(noise)
+    predicted = curved_along(Parts.about(
+        moments.mean, moments, *third_cumulants([order], jitter, cycles, single)))
     signal = AveragedSignal(cycles, ratio, order)
     draws = np.abs(monte_carlo(signal.whole_trigger_cycles, distribution, cycles, 20_000, seed=6,
                                line_variance=noise))

@@ -15,11 +15,12 @@ from typing import Any
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
+from sa_jitter_ros.prediction.amplitude_distribution import curved_along
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Uniform
 from sa_jitter_ros.prediction.moments import cycle_moments, CycleMoments
+from sa_jitter_ros.prediction.parts import Parts
 from scipy.stats import skew
 from validation.analytic import approximate_cycle_moments, laguerre_distribution, uniform_mean
 from validation.monte_carlo import AveragedSignal, monte_carlo
@@ -85,7 +86,8 @@ def _eighth(cycles: int, width: float, sample: Array) -> dict[str, float]:
     processes = [IndependentPulseJitter(Uniform(width))]
     moments = cycle_moments([1.0], processes)
     average = moments.averaged(cycles)
-    curved = curved_distribution(average, *third_cumulants([1.0], processes, cycles, moments))
+    curved = curved_along(Parts.about(
+        average.mean, average, *third_cumulants([1.0], processes, cycles, moments)))
     return {'distance_of_the_approximation': _distance(sample, expansion.amplitude_cdf),
             'distance_with_exact_moments': _distance(
                 sample, laguerre_distribution(average).amplitude_cdf),

@@ -31,10 +31,10 @@ from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.change_test import LEAST_LEARNED
 from sa_jitter_ros.monitoring.monitor import Settings
-from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
+from sa_jitter_ros.offline.average_recording import (
+    average_file, AverageJob, RECORDINGS, Row, write_tables)
 from sa_jitter_ros.offline.changes import Changes, find_changes, SETTINGS, settings_of
 from sa_jitter_ros.offline.settings import MachineFile
-from sa_jitter_ros.offline.tables import RECORDINGS, write_changes, write_tables
 from sa_jitter_ros.recordings.fields import fields_of
 
 
@@ -128,7 +128,7 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     found = find_changes(
         options.output, [job.name for job in jobs if job.name in averaged], settings,
         jobs[0].machine.machine, state=options.state)
-    write_changes(options.output, found, figure=not options.no_figures)
+    found.write(options.output, figure=not options.no_figures)
     if not options.no_figures:
         from sa_jitter_ros.offline.machine_page import PAGE, write_page
         write_page(options.output / found.recordings[-1].name, found, place=options.output / PAGE)

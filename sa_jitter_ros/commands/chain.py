@@ -22,7 +22,7 @@ import sys
 
 from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.nodes.base import run_nodes
-from sa_jitter_ros.nodes.renaming import common_name
+from sa_jitter_ros.nodes.parameters import common_name
 
 NODES = ('synchronous_averager', 'jitter_predictor', 'residual_analyser')
 OTHERS = ('change_monitor', 'live_view', 'tach_detector')

@@ -31,6 +31,8 @@ def check_figure(check: KeyphasorCheck, title: str) -> Figure:
     panels = figure.subplots(len(drawn), 1, squeeze=False)[:, 0]
     for axes, draw in zip(panels, drawn):
         draw(axes, check)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize='small', loc='best')
     panels[0].set_title(title, fontsize='medium')
     return figure
 
@@ -51,10 +53,8 @@ def _draw_speed(axes: Axes, check: KeyphasorCheck) -> None:
         if times.size:
             axes.plot(times, np.full(times.size, low - place * room), '|', color=color,
                       markersize=9.0, label=f'{times.size} {label}')
-    axes.set_xlabel('time [s]')
-    axes.set_ylabel('tach shaft [Hz]')
+    axes.set(xlabel='time [s]', ylabel='tach shaft [Hz]')
     axes.margins(x=0.01)
-    axes.legend(fontsize='small', loc='best')
 
 
 def _draw_marks(axes: Axes, check: KeyphasorCheck) -> None:
@@ -72,12 +72,9 @@ def _draw_marks(axes: Axes, check: KeyphasorCheck) -> None:
                        in count.alternatives[:3])
     axes.set_title(f'{pattern.teeth} marks a revolution, {pattern.teeth - pattern.present} missing'
                    + (f'; or {others}' if others else ''), fontsize='medium')
-    axes.set_xlim(-0.7, pattern.teeth - 0.3)
+    axes.set(xlim=(-0.7, pattern.teeth - 0.3), xlabel='mark', ylabel='late [degrees]')
     if pattern.teeth <= _NAMED:
         axes.set_xticks(range(pattern.teeth))
-    axes.set_xlabel('mark')
-    axes.set_ylabel('late [degrees]')
-    axes.legend(fontsize='small', loc='best')
 
 
 def _draw_lines(axes: Axes, check: KeyphasorCheck) -> None:
@@ -102,8 +99,6 @@ def _draw_lines(axes: Axes, check: KeyphasorCheck) -> None:
                       ha='center', fontsize='x-small')
     axes.margins(y=0.15)
     axes.set_ylim(bottom=0.0)
-    axes.set_xlim(0.0, 1.05 * float(place.max()))
     shaft = '' if ratio == 1.0 else f' at ratio {ratio:.6g}'
-    axes.set_xlabel(f'order of the shaft{shaft}')
-    axes.set_ylabel('above the noise [dB]')
-    axes.legend(fontsize='small', loc='best')
+    axes.set(xlim=(0.0, 1.05 * float(place.max())), xlabel=f'order of the shaft{shaft}',
+             ylabel='above the noise [dB]')

@@ -11,7 +11,7 @@
 """Command lines: a parser with errors of one line, and the options of commands for recordings."""
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 import gc
 from io import UnsupportedOperation
@@ -24,20 +24,21 @@ from typing import Any, NoReturn, TypeVar
 import warnings
 
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, one_line, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.lifetime import in_main_thread
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.settings import AVERAGER, section
+from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.recordings.channel_units import channels_of
 from sa_jitter_ros.recordings.fields import fields_of
+from sa_jitter_ros.recordings.reading import READ_PARAMETERS
 from sa_jitter_ros.tacholess.recording import Tacholess
 
 Found = TypeVar('Found')
 
 FORMATS = '.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2'
+_METAVARS = {int: 'N', float: 'X', str: 'NAME'}
 _OBJECTS = 1_000_000  # new ones after which Python looks for garbage, as a rule 700
-# Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
-_READ_OPTIONS = ('acquisition', 'sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
 
 
 class Parser(argparse.ArgumentParser):
@@ -88,11 +89,13 @@ def run_to_end(run: Callable[[argparse.Namespace, Progress], Found],
         require_writable(options.output)
         found = run(options, progress)
     except OSError as error:
+        if error.filename is None:
+            discard_output()  # it may be what cannot be written
         progress.say(f'{error.filename or options.output}: {error.strerror}: make room, or give '
                      'another folder; what was finished stays' if error.strerror else str(error))
         return 2
     except SaJitterError as error:
-        progress.say(' '.join(str(error).split()))
+        progress.say(one_line(error))
         return 2
     except KeyboardInterrupt:
         progress.say(stopped)
@@ -134,8 +137,7 @@ def plain_warnings(program: str) -> Iterator[None]:
             yield
         finally:
             for item in caught:
-                print(f'{program}: warning: {" ".join(str(item.message).split())}',
-                      file=sys.stderr)
+                print(f'{program}: warning: {one_line(item.message)}', file=sys.stderr)
 
 
 def require_writable(folder: Path) -> None:
@@ -153,25 +155,29 @@ def require_writable(folder: Path) -> None:
                              'give another folder') from None
 
 
+def option_of(name: str) -> str:
+    """Return the option of a parameter."""
+    return f'--{name.replace("_", "-")}'
+
+
+def add_parameters(parser: Any, parameters: Iterable[Parameter]) -> None:
+    """Add options that are parameters of nodes, too; None where they are not given."""
+    for item in parameters:
+        parser.add_argument(
+            option_of(item.name), type=item.kind, nargs='+' if item.is_list else None,
+            choices=item.choices or None, help=item.description.replace('%', '%%'),
+            metavar=None if item.choices else item.unit.upper() or _METAVARS[item.kind])
+
+
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options for fields and channels, named as the parameters of the player."""
+    """Add the options for fields and channels."""
     parser.add_argument('--field', action='append', default=[], dest='fields',
                         metavar='NAME=KEY|VALUE',
                         help='field of the recording: the key that the file has for it '
                         '(pulse_times=tach), or its value (sample_rate=97656, orders=20,40); '
                         'may be repeated')
-    parser.add_argument('--acquisition', type=int, default=0, metavar='N',
-                        help='number of the acquisition, from 0, in a file with several')
-    group = parser.add_argument_group('channels, if the file does not name them (.wav, .csv)')
-    group.add_argument('--tach-channel', default='', metavar='CHANNEL',
-                       help='name, or number from 0, of the channel with the tach waveform')
-    group.add_argument('--vibration-channels', nargs='+', default=(), metavar='CHANNEL',
-                       help='names or numbers of the vibration channels (default: all except the '
-                       'tach waveform)')
-    group.add_argument('--time-column', default='', metavar='COLUMN',
-                       help='name or number of the column of a .csv with the times in s')
-    group.add_argument('--sample-rate', type=float, metavar='HZ',
-                       help='sampling rate of the vibration, if the file does not contain it')
+    group = parser.add_argument_group('what is read, if the file does not say it')
+    add_parameters(group, READ_PARAMETERS)
 
 
 def add_tacholess_options(parser: argparse.ArgumentParser) -> None:
@@ -229,4 +235,4 @@ def player_options(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _given(options: argparse.Namespace) -> dict[str, Any]:
-    return {name: value for name in _READ_OPTIONS if (value := getattr(options, name))}
+    return {item.name: value for item in READ_PARAMETERS if (value := getattr(options, item.name))}

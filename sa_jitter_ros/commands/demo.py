@@ -15,6 +15,7 @@ It plays a recording, or a simulated gearbox, through tach detector, averager an
 compares the measured with the predicted attenuation.
 """
 
+import argparse
 from collections.abc import Callable, Mapping, Sequence
 import os
 from pathlib import Path
@@ -32,10 +33,11 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, discard_output, FORMATS, Parser, player_options, read_options)
+    add_recording_options, FORMATS, Parser, player_options, read_options, run_to_end)
 from sa_jitter_ros.commands.demo_plan import (
     Plan, plan_doubts, plan_recording, plan_simulation, with_machine)
 from sa_jitter_ros.commands.demo_report import write_results
+from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.messages import (
@@ -149,16 +151,16 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
         'synchronous_averager': {}, 'jitter_predictor': {},
         plan.source: {**plan.source_parameters, 'playing': False}}
     if plan.params is None:
-        keyphasor = {'keyphasor_rate': plan.keyphasor_rate, 'trigger_cycles': plan.trigger_cycles,
-                     'pulses_per_revolution': plan.pulses_per_revolution,
-                     'pulses_per_trigger': plan.pulses_per_trigger}
+        model = plan.model
+        keyphasor = {name: getattr(model, name) for name in (
+            'keyphasor_rate', 'trigger_cycles', 'pulses_per_revolution', 'pulses_per_trigger')}
         nodes['synchronous_averager'] = {
             **keyphasor, 'missing_teeth': plan.missing_teeth, 'maximum_discarded': 0.5,
-            f'{plan.shaft}.ratio': plan.ratio,
-            f'{plan.shaft}.orders': plan.orders, 'correct_jitter': True}
+            f'{plan.shaft}.ratio': model.ratio, f'{plan.shaft}.orders': model.orders,
+            'correct_jitter': True}
         nodes['jitter_predictor'] = {
-            **keyphasor, 'trigger_speed': plan.speed, 'ratio': plan.ratio, 'orders': plan.orders,
-            'follow_shaft_speed': True}
+            **keyphasor, 'trigger_speed': model.trigger_speed, 'ratio': model.ratio,
+            'orders': model.orders, 'follow_shaft_speed': True}
     if plan.source == 'machine_simulator':
         nodes[plan.source]['duration'] = 0.0 if live else plan.seconds
     elif live:
@@ -274,7 +276,7 @@ def write_report(plan: Plan, watcher: Watcher, output: Path) -> None:
               if 'pulse_error' in item]
     if pulses:
         std = np.sqrt(np.nanmean(np.concatenate(pulses) ** 2))
-        declared = 1.0 / plan.keyphasor_rate / 12**0.5
+        declared = 1.0 / plan.model.keyphasor_rate / 12**0.5
         print(f'\nstandard deviation of the pulse errors: {1e6 * std:.3g} us recovered from the '
               f'vibration, {1e6 * declared:.3g} us declared')
     averager = watcher.status.get('synchronous_averager', {})
@@ -308,32 +310,33 @@ def _parser() -> Parser:
     return parser
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the demo; return 0, or 2 after one line on unusable input or output."""
-    options = _parser().parse_args(args)
+def planned(options: argparse.Namespace) -> Plan:
+    """Return the plan, and say what is doubtful; raises SaJitterError."""
+    if not options.recording:
+        return plan_simulation(options.params or shipped('machine.yaml'))
+    recording, remarks = usable_channels(read(options.recording, **read_options(options)))
+    plan = plan_recording(options.recording, recording, keyphasor_rate=options.keyphasor_rate,
+                          parameters=player_options(options))
+    if options.params:
+        plan = with_machine(plan, options.params)
+    for remark in (*remarks, *plan_doubts(plan, recording)):
+        print(f'warning: {remark}', flush=True)
+    return plan
+
+
+def run(options: argparse.Namespace, progress: Progress) -> int:
+    """Play, average, predict and write the files; raises SaJitterError, OSError."""
+    plan = planned(options)
+    options.output.mkdir(parents=True, exist_ok=True)
+    model = plan.model
+    print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
+          f'{model.trigger_speed:.4g} Hz, {model.trigger_cycles} trigger cycles per average')
+    if not options.live:
+        print('to watch it live in a web browser: ./run demo --live')
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     children: list[subprocess.Popen[bytes]] = []
     context = rclpy.Context()
-    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores SIGINT
-        signal.signal(number, signal.default_int_handler)
     try:
-        if options.recording:
-            recording, remarks = usable_channels(
-                read(options.recording, **read_options(options)))
-            plan = plan_recording(
-                options.recording, recording, keyphasor_rate=options.keyphasor_rate,
-                parameters=player_options(options))
-            if options.params:
-                plan = with_machine(plan, options.params)
-            for remark in (*remarks, *plan_doubts(plan, recording)):
-                print(f'warning: {remark}', flush=True)
-        else:
-            plan = plan_simulation(options.params or shipped('machine.yaml'))
-        options.output.mkdir(parents=True, exist_ok=True)  # fails before the run, not after it
-        print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
-              f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles per average')
-        if not options.live:
-            print('to watch it live in a web browser: ./run demo --live')
-        os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         rclpy.init(context=context)
         watcher = Watcher(context=context)
         executor = SingleThreadedExecutor(context=context)
@@ -345,20 +348,19 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.live:
             watcher.destroy_node()  # it would keep all results
             print('the machine runs on and the page stays until Ctrl-C', flush=True)
-            ended = stay(children)
-            if ended:
+            if ended := stay(children):
                 raise SaJitterError(f'a node ended with status {ended}')
-    except (SaJitterError, OSError) as error:
-        if isinstance(error, OSError) and error.filename is None:
-            discard_output()  # it may be what cannot be written
-        print(f'demo: {error}', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
     finally:
         stop(children)
         context.try_shutdown()
     return 0
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the demo; return 0, or 2 after one line on unusable input or output."""
+    options = _parser().parse_args(args)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
+    return run_to_end(run, lambda options, status: status, options, Progress('demo'))
 
 
 if __name__ == '__main__':

@@ -20,6 +20,7 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.offline.settings import choose
 from sa_jitter_ros.parameter_file import read_parameters
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings import Recording
 from sa_jitter_ros.recordings.channel_units import channels_of, scale_of
 
@@ -31,10 +32,9 @@ class Plan:
     """
     How signals are played, averaged and predicted.
 
-    `source` is the node that plays them, with `source_parameters`, for `seconds`. `speed` of the
-    tach shaft and `keyphasor_rate` are in Hz; `pulses_per_trigger` is 0 for all pulses of a
-    revolution. `waveform` is true if the pulses come from a tach waveform; `note` is for the user.
-    With `params`, a machine file, the nodes take their parameters from it.
+    `source` is the node that plays them, with `source_parameters`, for `seconds`. `model` is that
+    of the first of the `shafts`. `waveform` is true if the pulses come from a tach waveform;
+    `note` is for the user. With `params`, a machine file, the nodes take their parameters from it.
     """
 
     source: str
@@ -43,14 +43,8 @@ class Plan:
     seconds: float
     channels: tuple[str, ...]
     unit: str
-    speed: float
-    keyphasor_rate: float
-    pulses_per_revolution: int
-    ratio: float
-    trigger_cycles: int
-    orders: tuple[float, ...]
+    model: DeclaredModel
     waveform: bool = False
-    pulses_per_trigger: int = 0
     missing_teeth: int = 0
     note: str = ''
     shafts: tuple[str, ...] = ('shaft',)
@@ -58,31 +52,26 @@ class Plan:
 
     @property
     def shaft(self) -> str:
-        """Return the first shaft, which ratio and orders are of."""
+        """Return the first shaft, which the model is of."""
         return self.shafts[0]
 
 
 def plan_simulation(params: Path) -> Plan:
     """Return the plan for the simulated gearbox of a machine file; raises SaJitterError."""
-    gains = read_parameters(params, 'machine_simulator').get('channel_gains', [1.0])
-    channels = scale_of(channels_of(read_parameters(params, 'machine_simulator')), len(gains))
-    plan = Plan(
+    values = read_parameters(params, 'machine_simulator')
+    channels = scale_of(channels_of(values), len(values.get('channel_gains', [1.0])))
+    models = read_declaration(params).models
+    return Plan(
         source='machine_simulator', source_parameters={}, title='simulated gearbox',
         seconds=SIMULATED_SECONDS, channels=channels.names, unit=channels.units[0],
-        speed=0.0, keyphasor_rate=0.0, pulses_per_revolution=1, ratio=1.0, trigger_cycles=1,
-        orders=())
-    planned = with_machine(plan, params)
-    return replace(planned, speed=read_declaration(params).models[planned.shaft].trigger_speed)
+        model=next(iter(models.values())), shafts=tuple(models), params=params)
 
 
 def with_machine(plan: Plan, params: Path) -> Plan:
-    """Return a plan for the machine of a file, with numbers of its first shaft; SaJitterError."""
+    """Return a plan for the machine of a file, at the speed of the signals; SaJitterError."""
     models = read_declaration(params).models
-    model = next(iter(models.values()))
-    declared = {name: getattr(model, name) for name in (
-        'keyphasor_rate', 'pulses_per_revolution', 'pulses_per_trigger', 'ratio',
-        'trigger_cycles', 'orders')}
-    return replace(plan, params=params, shafts=tuple(models), note='', **declared)
+    model = replace(next(iter(models.values())), trigger_speed=plan.model.trigger_speed)
+    return replace(plan, params=params, shafts=tuple(models), note='', model=model)
 
 
 def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 0.0,
@@ -92,7 +81,7 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
 
     `path` and `parameters` are those with which `recording_player` opens the recording. With
     `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if the
-    keyphasor had been sampled with it. Raises `RecordingError` if the recording cannot be used.
+    keyphasor had been sampled with it. Raises `SaJitterError` if the recording cannot be used.
     """
     choice = choose(recording)
     waveform = recording.pulse_times is None and recording.tach is not None
@@ -108,21 +97,21 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
         source_parameters={'recording': str(path), 'keyphasor_rate': keyphasor_rate,
                            **(parameters or {})},
         title=path.name, seconds=recording.duration,
-        channels=recording.channel_names, unit=recording.units[0] if recording.units else '',
-        speed=choice.speed, keyphasor_rate=rate,
-        pulses_per_revolution=recording.pulses_per_revolution, ratio=recording.ratio,
-        trigger_cycles=choice.trigger_cycles, orders=choice.orders,
-        waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0,
-        missing_teeth=recording.missing_teeth, note=note)
+        channels=recording.channel_names, unit=recording.units[0],
+        model=DeclaredModel(rate, choice.speed, choice.trigger_cycles, choice.orders,
+                            recording.ratio, recording.pulses_per_revolution,
+                            recording.pulses_per_trigger or 0),
+        waveform=waveform, missing_teeth=recording.missing_teeth, note=note)
 
 
 def plan_doubts(plan: Plan, recording: Recording) -> tuple[str, ...]:
     """Return what contradicts each other in a recording and its plan, a sentence each."""
     declared = plan.params is not None or recording.tach_rate is not None
+    model = plan.model
     return doubts(
-        recording, recording.keyphasor_pulses(), orders=plan.orders, ratio=plan.ratio,
-        pulses_per_revolution=plan.pulses_per_revolution,
-        pulses_per_trigger=plan.pulses_per_trigger or None, missing_teeth=plan.missing_teeth,
-        jitter_std=1.0 / math.sqrt(12.0) / plan.keyphasor_rate
+        recording, recording.keyphasor_pulses(), orders=model.orders, ratio=model.ratio,
+        pulses_per_revolution=model.pulses_per_revolution,
+        pulses_per_trigger=model.pulses_per_trigger or None, missing_teeth=plan.missing_teeth,
+        jitter_std=1.0 / math.sqrt(12.0) / model.keyphasor_rate
         if declared and not plan.waveform and not plan.source_parameters.get('keyphasor_rate')
         else None)

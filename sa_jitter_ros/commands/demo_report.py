@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.commands.demo_plan import Plan
 from sa_jitter_ros.machine import Machine
@@ -25,7 +25,6 @@ from sa_jitter_ros.offline.files import finished_together, Signals, write_averag
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import MachineFile
 
-FloatArray = NDArray[np.float64]
 
 Results = Sequence[Mapping[str, AverageMessage]]
 _FIELDS = ('raw_amplitude', 'corrected_amplitude', 'noise_standard_deviation', 'attenuation')

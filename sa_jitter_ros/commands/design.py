@@ -26,9 +26,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogLocator, MaxNLocator, NullFormatter
 import numpy as np
-from sa_jitter_ros.commands.command_line import Parser, show
-from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.commands.command_line import add_parameters, option_of, Parser, show
+from sa_jitter_ros.declaration import MODEL_PARAMETERS, read_declaration, SHAFT_PARAMETERS
 from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.prediction.comb import Leakage
 from sa_jitter_ros.prediction.design import (
     Design, design, design_grid, detection_probability, RATE_DISTRIBUTIONS,
@@ -46,6 +47,13 @@ EXAMPLES = """examples:
            --change 0.05 --false-alarm-rate 0.01
 """
 
+_NEEDED = ('orders', 'trigger_speed')
+_MACHINE = (*_NEEDED, 'ratio', 'pulses_per_revolution', 'pulses_per_trigger',
+            'jitter_distribution', 'noise_std', 'sample_rate')
+_KNOWN = {item.name: item for item in (*SHAFT_PARAMETERS, *MODEL_PARAMETERS)} | {
+    'jitter_distribution': Parameter(
+        'jitter_distribution', 'uniform', 'distribution of the pulse error, whose width follows '
+        'from keyphasor_rate', choices=RATE_DISTRIBUTIONS)}
 _STEPS = (1.0, 2.0, 5.0)
 _KEPT = '#d9ead3'
 _BEST = 5  # numbers of trigger cycles to recommend
@@ -63,30 +71,10 @@ def make_parser() -> Parser:
                          'machine, where the options below do not say otherwise')
     machine.add_argument('--shaft', default='', metavar='NAME',
                          help='shaft of interest in that file (default: its first)')
-    machine.add_argument('--orders', type=float, nargs='+', metavar='ORDER',
-                         help='orders to monitor, multiples of the shaft of interest')
-    machine.add_argument('--trigger-speed', type=float, metavar='HZ',
-                         help='speed of the tach shaft, which carries the keyphasor, Hz')
-    machine.add_argument('--ratio', type=float,
-                         help='speed of the shaft of interest / speed of the tach shaft (1)')
-    machine.add_argument('--pulses-per-revolution', type=int, metavar='N',
-                         help='keyphasor pulses per revolution of the tach shaft (1)')
-    machine.add_argument('--pulses-per-trigger', type=int, metavar='N',
-                         help='pulses per trigger cycle (default: all pulses of a revolution)')
-    machine.add_argument('--jitter-distribution', choices=RATE_DISTRIBUTIONS,
-                         help='distribution of the pulse error; the keyphasor rate determines '
-                         'its width (uniform)')
-    machine.add_argument('--noise-std', type=float, metavar='X',
-                         help='standard deviation of white noise per vibration sample, in units '
-                         "of the component's amplitude (0)")
-    machine.add_argument('--sample-rate', type=float, metavar='HZ',
-                         help='sampling rate of the vibration, Hz; needed with --noise-std')
+    add_parameters(machine, [_KNOWN[name] for name in _MACHINE])
     settings = parser.add_argument_group(
         'settings (chosen if not given; those in MACHINE.yaml are not taken)')
-    settings.add_argument('--keyphasor-rate', type=float, metavar='HZ',
-                          help='rate at which the keyphasor is sampled, Hz')
-    settings.add_argument('--trigger-cycles', type=int, metavar='N',
-                          help='trigger cycles in an average')
+    add_parameters(settings, [_KNOWN[name] for name in ('keyphasor_rate', 'trigger_cycles')])
     limits = parser.add_argument_group('limits')
     limits.add_argument('--loss', '--attenuation', dest='maximum_loss', type=float, default=0.05,
                         metavar='X', help='largest loss of the mean amplitude, a fraction (0.05)')
@@ -114,9 +102,7 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
     """Return the options, with the machine's from its file or their defaults; SaJitterError."""
     parser = make_parser()
     options = parser.parse_args(args)
-    machine: dict[str, Any] = {
-        'ratio': 1.0, 'pulses_per_revolution': 1, 'pulses_per_trigger': 0,
-        'jitter_distribution': 'uniform', 'noise_std': 0.0, 'sample_rate': 0.0}
+    machine = {name: _KNOWN[name].default for name in _MACHINE if name not in _NEEDED}
     if options.params:
         declaration = read_declaration(options.params)
         shaft = options.shaft or next(iter(declaration.models))
@@ -124,12 +110,11 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
             raise ParameterError(f'--shaft is {shaft!r}: {options.params} has '
                                  f'{", ".join(declaration.models)}')
         machine = {name: getattr(declaration.models[shaft], name)
-                   for name in ('orders', 'trigger_speed', *machine)}
+                   for name in _MACHINE}
     for name, value in machine.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
-    missing = [f'--{name.replace("_", "-")}' for name in ('orders', 'trigger_speed')
-               if getattr(options, name) is None]
+    missing = [option_of(name) for name in _NEEDED if getattr(options, name) is None]
     if missing:
         parser.error(f'the following arguments are required: {", ".join(missing)} (or --params)')
     del options.params, options.shaft
@@ -268,9 +253,8 @@ def draw_leakage(axes: Axes, remaining: Leakage) -> None:
     axes.legend(fontsize=8)
 
 
-def draw_detection(
-    axes: Axes, found: Design, detection: np.ndarray, options: argparse.Namespace,
-) -> None:
+def draw_detection(axes: Axes, found: Design, detection: np.ndarray, options: argparse.Namespace
+                   ) -> None:
     """Draw the probability of detection over the size of the change."""
     changes = np.linspace(0.0, 2.0 * options.change, _CHANGES)
     changes = changes[changes >= -1.0]

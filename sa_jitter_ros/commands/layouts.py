@@ -15,7 +15,7 @@ Topics, orders, channels and units are those of the machine file.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 import json
 from pathlib import Path
@@ -29,8 +29,7 @@ from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader
 from sa_jitter_ros.commands.command_line import Parser, run_to_end, show
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE as PREDICTOR, read_declaration
-from sa_jitter_ros.nodes.messages import (
-    PREDICTION_FIELDS, PredictionMessage, ResidualMessage)
+from sa_jitter_ros.nodes.messages import PREDICTION_FIELDS, PredictionMessage, ResidualMessage
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.settings import AVERAGER, MachineFile
 from sa_jitter_ros.parameter_file import named_parameters, read_parameters
@@ -40,6 +39,7 @@ PLOTJUGGLER, FOXGLOVE = 'plotjuggler.xml', 'foxglove.json'
 AGGREGATOR = 'diagnostic_aggregator.yaml'
 _COLOURS = ('#1f77b4', '#d62728', '#2ca02c', '#ff7f0e', '#9467bd', '#8c564b', '#e377c2',
             '#7f7f7f', '#bcbd22', '#17becf')
+_SPEED = 'Speed of the tach shaft'
 _CHANNELS = 4  # of which amplitudes are plotted
 _HEADER = len(fields(AverageHeader))
 _ORDERS = next(item.default for item in shaft_parameters('') if item.name == '.orders')
@@ -89,23 +89,8 @@ class Shown:
             tuple(node for _, nodes, always in _GROUPS for node in nodes
                   if always or named_parameters(params, (node,))))
 
-    def waveforms(self) -> Iterator[tuple[str, str]]:
-        """Iterate over the topics of waveforms and their labels."""
-        for shaft in self.shafts:
-            for kind, label in (('synchronous_average', 'raw'), ('corrected_average',
-                                                                 'corrected')):
-                yield f'{self.prefix}{shaft}/{kind}', f'{shaft}, {label}'
-
-    def texts(self) -> Iterator[str]:
-        """Iterate over the topics that are read, with the field."""
-        yield f'{self.prefix}missing_effect.data'
-        if 'change_monitor' in self.nodes:
-            yield f'{self.prefix}change.data'
-        for shaft in self.shafts:
-            yield f'{self.prefix}{shaft}/summary'
-
     def plots(self, shaft: str) -> dict[str, list[Curve]]:
-        """Return the curves of a shaft by the titles of their plots."""
+        """Return the curves of a shaft by the titles of their plots, that of the speed first."""
         orders, topic = self.shafts[shaft], f'{self.prefix}{shaft}/order_amplitude'
 
         def of_order(field: str, channel: int = 0) -> list[Curve]:
@@ -114,7 +99,7 @@ class Shown:
                           + place, f'order {order_text(order)}')
                     for k, order in enumerate(orders[:len(_COLOURS)])]
 
-        found = {}
+        found = {_SPEED: [Curve(f'{self.prefix}shaft_speed', None, 'Hz')]}
         for channel, name in [*self.channels.items()][:_CHANNELS]:
             for kind in ('raw', 'corrected'):
                 found[f'Amplitude, {kind}, {name}'] = of_order(f'{kind}_amplitude', channel)
@@ -134,10 +119,6 @@ class Shown:
                   name.replace('_', ' ')) for name in ('rms', 'kurtosis', 'crest_factor')]
         return {title: curves for title, curves in found.items() if curves}
 
-    def speed(self) -> dict[str, list[Curve]]:
-        """Return the plot of the speed."""
-        return {'Speed of the tach shaft': [Curve(f'{self.prefix}shaft_speed', None, 'Hz')]}
-
 
 def plotjuggler(machine: Shown) -> str:
     """Return the layout of PlotJuggler: for each shaft a tab of plots under the speed."""
@@ -146,8 +127,8 @@ def plotjuggler(machine: Shown) -> str:
         'parent': 'main_window', 'name': 'Main Window'})
     for shaft in machine.shafts:
         tab = ET.SubElement(tabs, 'Tab', tab_name=shaft, containers='1')
-        plots = [*machine.plots(shaft).items()]
-        rows = [[*machine.speed().items()], *(plots[k:k + 2] for k in range(0, len(plots), 2))]
+        speed, *plots = machine.plots(shaft).items()
+        rows = [[speed], *(plots[k:k + 2] for k in range(0, len(plots), 2))]
         outer = _splitter(ET.SubElement(tab, 'Container'), '-', len(rows))
         for row in rows:
             inner = _splitter(outer, '|', len(row))
@@ -194,18 +175,20 @@ def foxglove(machine: Shown) -> str:
                 {'value': value, 'label': label, 'enabled': True, 'timestampMethod': 'receiveTime'}
                 for value, label in paths]})
 
-    plots = machine.speed() | {
-        title if len(machine.shafts) == 1 else f'{shaft}: {title}': curves
-        for shaft in machine.shafts for title, curves in machine.plots(shaft).items()}
+    plots = {title if title == _SPEED or len(machine.shafts) == 1 else f'{shaft}: {title}': curves
+             for shaft in machine.shafts for title, curves in machine.plots(shaft).items()}
     left = [plot(title, [
         (f'{curve.topic}.data' + ('' if curve.element is None else f'[{curve.element}]'),
          curve.label) for curve in curves]) for title, curves in plots.items()]
+    texts = ['missing_effect.data', *['change.data'] * ('change_monitor' in machine.nodes),
+             *(f'{shaft}/summary' for shaft in machine.shafts)]
     right = [
         plot('Waveform of one revolution', [
-            (f'{topic}.data[{_HEADER}:]', label) for topic, label in machine.waveforms()],
-            'index'),
-        *(add('RawMessages', path.removesuffix('.data'), {'topicPath': path})
-          for path in machine.texts()),
+            (f'{machine.prefix}{shaft}/{kind}_average.data[{_HEADER}:]', f'{shaft}, {label}')
+            for shaft in machine.shafts
+            for kind, label in (('synchronous', 'raw'), ('corrected', 'corrected'))], 'index'),
+        *(add('RawMessages', machine.prefix + text.removesuffix('.data'), {
+            'topicPath': machine.prefix + text}) for text in texts),
         add('DiagnosticSummary', 'all', {
             'topicToRender': '/diagnostics', 'minLevel': 0, 'pinnedIds': [],
             'hardwareIdFilter': '', 'sortByLevel': True})]

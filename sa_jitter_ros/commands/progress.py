@@ -60,27 +60,25 @@ class Progress:
 
     def tick(self) -> None:
         """Show for how long the program has worked, on no terminal only if a step takes long."""
-        now = time.monotonic()
-        if self._quiet or (not self._bar and now - self._last < _LINE):
-            return
-        self._last = now
-        self._write(f'{self._program}: working, {now - self._start:.0f} s',
-                    end='' if self._bar else '\n')
-        self._drawn = self._bar
+        self._draw(f'working, {time.monotonic() - self._start:.0f} s', 0.0)
 
     def show(self, share: float, text: str) -> None:
         """Show the share that is done (0 to 1), and a text."""
-        now = time.monotonic()
-        if self._quiet or now - self._last < (_REDRAW if self._bar else _LINE):
-            return
-        self._last = now
-        left = (now - self._start) * (1.0 / share - 1.0) if share > 0.0 else float('inf')
+        past = time.monotonic() - self._start
+        left = past * (1.0 / share - 1.0) if share > 0.0 else float('inf')
         line = f'{share:4.0%}  {text}' + (f'  {left:.0f} s left' if left < 1e6 else '')
         if self._bar:
             full = round(_WIDTH * min(share, 1.0))
             line = f'[{"#" * full}{"." * (_WIDTH - full)}] {line}'
-        self._write(f'{self._program}: {line}', end='' if self._bar else '\n')
-        self._drawn = self._bar
+        self._draw(line, _REDRAW)
+
+    def _draw(self, line: str, pause: float) -> None:
+        """Show a line that the next one replaces, after a pause (s); on no terminal at times."""
+        now = time.monotonic()
+        if not self._quiet and now - self._last >= (pause if self._bar else _LINE):
+            self._last = now
+            self._write(f'{self._program}: {line}', end='' if self._bar else '\n')
+            self._drawn = self._bar
 
     def say(self, line: str) -> None:
         """Show a line that stays, also if quiet."""

@@ -14,8 +14,7 @@ The machine by its parts: ratios and orders from numbers of teeth and geometry o
 `Machine` is read from the machine file, `following` gives the parameters that follow from it.
 """
 
-from sa_jitter_ros.machine.following import following
-from sa_jitter_ros.machine.limits import LEVELS, Limit
-from sa_jitter_ros.machine.train import Machine, PREFIX, UNKNOWN
+from sa_jitter_ros.machine.parts import LEVELS, Limit
+from sa_jitter_ros.machine.train import following, Machine, PREFIX, UNKNOWN
 
 __all__ = ['LEVELS', 'PREFIX', 'UNKNOWN', 'Limit', 'Machine', 'following']

@@ -9,7 +9,7 @@
 # the License.
 
 """
-The parts of a machine, and the orders at which each shows.
+The parts of a machine, the orders at which each shows, and limits by the names of the parts.
 
 Orders of a part are multiples of the speed of a shaft that it is on.
 """
@@ -31,6 +31,8 @@ _TEETH = Parameter('teeth', 0, 'number of teeth', minimum=_FEWEST_TEETH, maximum
 _SHAFT = Parameter('shaft', '', 'name of a shaft')
 _LENGTH = Parameter('length', 0.0, 'a length', unit='m', above=0.0)
 _ORDER = Parameter('order', 0.0, 'a multiple of the speed of the shaft', above=0.0)
+LEVELS = ('warn', 'alarm')
+_OF = ('order', 'part', 'indicator')
 
 
 class Part:
@@ -50,8 +52,27 @@ class Part:
             object.__setattr__(self, name, value)
 
 
+class Coupling(Part):
+    """A part that couples two shafts, whose names are the values of `ENDS`."""
+
+    ENDS: ClassVar[tuple[str, str]] = ('shaft', 'mate_shaft')
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """Return the shafts that the part couples."""
+        first, second = (getattr(self, name) for name in self.ENDS)
+        return first, second
+
+    def check(self, place: str) -> None:
+        """Check the values; raises ParameterError, which names the place in the file."""
+        super().check(place)
+        if len({*self.ends}) < 2:
+            raise ParameterError(f'{place}: {" and ".join(self.ENDS)} are both {self.ends[0]}: '
+                                 'give two shafts')
+
+
 @dataclass(frozen=True)
-class GearPair(Part):
+class GearPair(Coupling):
     """
     Two gears in mesh, with the numbers of their teeth.
 
@@ -67,13 +88,6 @@ class GearPair(Part):
     KINDS: ClassVar = {'shaft': _SHAFT, 'teeth': _TEETH, 'mate_shaft': _SHAFT,
                        'mate_teeth': _TEETH}
 
-    def check(self, place: str) -> None:
-        """Check the values; raises ParameterError, which names the place in the file."""
-        super().check(place)
-        if self.shaft == self.mate_shaft:
-            raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: gears in '
-                                 'mesh are on two shafts')
-
     @property
     def ratio(self) -> Fraction:
         """Return the speed of the mate's shaft over that of the shaft."""
@@ -88,11 +102,6 @@ class GearPair(Part):
     def hunting_tooth(self) -> Fraction:
         """Return the order, of the shaft, at which the same two teeth meet."""
         return Fraction(self.assembly_phases, self.mate_teeth)
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Return the shafts that the pair couples."""
-        return self.shaft, self.mate_shaft
 
     def orders(self, name: str, shaft: str) -> dict[str, float]:
         """Return the orders of one of the shafts by name, `name` being that of the mesh."""
@@ -110,7 +119,7 @@ class GearPair(Part):
 
 
 @dataclass(frozen=True)
-class Belt(Part):
+class Belt(Coupling):
     """A belt or chain between two shafts: `ratio` is the speed of the mate's over the shaft's."""
 
     shaft: str
@@ -119,24 +128,13 @@ class Belt(Part):
     KINDS: ClassVar = {'shaft': _SHAFT, 'mate_shaft': _SHAFT,
                        'ratio': Parameter('ratio', 1.0, 'ratio of speeds', above=0.0)}
 
-    def check(self, place: str) -> None:
-        """Check the values; raises ParameterError, which names the place in the file."""
-        super().check(place)
-        if self.shaft == self.mate_shaft:
-            raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: give two')
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Return the shafts that the belt couples."""
-        return self.shaft, self.mate_shaft
-
     def orders(self, name: str, shaft: str) -> dict[str, float]:
         """Return no orders: a belt has no teeth in mesh."""
         return {}
 
 
 @dataclass(frozen=True)
-class PlanetaryStage(Part):
+class PlanetaryStage(Coupling):
     """
     A planetary stage, of which one of sun, ring and carrier is fixed.
 
@@ -158,6 +156,7 @@ class PlanetaryStage(Part):
     input_shaft: str
     output_shaft: str
     input: str | None = None  # noqa: A003 (the key of the machine file)
+    ENDS: ClassVar = ('input_shaft', 'output_shaft')
     MEMBERS: ClassVar = ('sun', 'ring', 'carrier')
     KINDS: ClassVar = {
         **dict.fromkeys(('sun', 'ring', 'planet'), _TEETH),
@@ -172,9 +171,6 @@ class PlanetaryStage(Part):
         if self.input == self.fixed:
             raise ParameterError(f'{place}.input is {self.input}, which is fixed: give another '
                                  'member')
-        if self.input_shaft == self.output_shaft:
-            raise ParameterError(f'{place}: input_shaft and output_shaft are both '
-                                 f'{self.input_shaft}: give two shafts')
         whose = (f'{place} does not assemble: sun {self.sun}, planet {self.planet}, ring '
                  f'{self.ring}')
         if abs(self.ring - self.sun - 2 * self.planet) > _SHIFTED:
@@ -212,11 +208,6 @@ class PlanetaryStage(Part):
         """Return the speed of the output shaft over that of the input shaft."""
         first, second = self.on_shafts
         return abs(self.speeds[second] / self.speeds[first])
-
-    @property
-    def ends(self) -> tuple[str, str]:
-        """Return the shafts that the stage couples."""
-        return self.input_shaft, self.output_shaft
 
     def orders(self, name: str, shaft: str) -> dict[str, float]:
         """Return the orders of one of the shafts by name; relative to the carrier."""
@@ -312,3 +303,51 @@ class Bearing(Part):
             found['2x ball'] = 2.0 * found['ball']
         return {f'bearing {name} {part}': order for part, order in found.items()
                 if order is not None}
+
+
+@dataclass(frozen=True)
+class Limit(Part):
+    """
+    A limit of an order, of what a part of the machine makes, or of a condition indicator.
+
+    `warn` and `alarm` are in the unit of the channel, `relative` ones times the baseline. Without
+    `channel`, a name or a number, all are meant; without `shaft` the only one that has it.
+    """
+
+    order: float | None = None
+    part: str | None = None
+    indicator: str | None = None
+    shaft: str | None = None
+    channel: str | None = None
+    warn: float | None = None
+    alarm: float | None = None
+    relative: bool | None = None
+    KINDS: ClassVar = {
+        'order': _ORDER,
+        **{name: Parameter(name, '', f'name of a {name}')
+           for name in ('part', 'indicator', 'shaft', 'channel')},
+        **{name: Parameter(name, 0.0, 'a limit', above=0.0) for name in LEVELS},
+        'relative': Parameter('relative', False, 'times the baseline')}
+
+    def check(self, place: str) -> None:
+        """Check the values; raises ParameterError, which names the place in the file."""
+        super().check(place)
+        given = [name for name in _OF if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ParameterError(f'{place} gives {" and ".join(given) or "no quantity"}: give one '
+                                 f'of {", ".join(_OF)}')
+        bounds = [*self.bounds.values()]
+        if not bounds:
+            raise ParameterError(f'{place} has neither warn nor alarm: give one, or both')
+        if bounds[0] > bounds[-1]:
+            raise ParameterError(f'{place}.warn is {self.warn:g}, above its alarm of '
+                                 f'{self.alarm:g}: a warning comes first; are they swapped?')
+        if self.relative and bounds[0] <= 1.0:
+            raise ParameterError(f'{place} is relative and {bounds[0]:g}: give times the '
+                                 'baseline, more than 1')
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """Return the bounds that are given, by level."""
+        return {level: value for level, value in zip(LEVELS, (self.warn, self.alarm))
+                if value is not None}

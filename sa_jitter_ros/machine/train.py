@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The train of a machine: its shafts, how fast each turns, and the names of their orders."""
+"""The train of a machine: how fast its shafts turn, their orders, parameters that follow."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.machine.limits import Limit
-from sa_jitter_ros.machine.parts import Bearing, Belt, GearPair, PlanetaryStage
+from sa_jitter_ros.machine.parts import Bearing, Belt, GearPair, Limit, PlanetaryStage
 from sa_jitter_ros.parameter_file import flattened, read_parameters
 from sa_jitter_ros.parameters import require_shaft_names
 
@@ -254,3 +253,43 @@ def _made(kind: str, name: str, given: Any) -> Any:
 
 #: A machine of which nothing is known.
 UNKNOWN = Machine()
+
+
+def following(given: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the parameters that follow from the machine among those given, which win over these.
+
+    Names are those of all nodes and commands; each takes what it has. Raises ParameterError for a
+    machine that contradicts itself, and for a shaft that it does not have and whose ratio is not
+    given.
+
+    >>> found = following({
+    ...     'shafts': ['input'], 'machine.tach_shaft': 'output', 'machine.gears.g.shaft': 'input',
+    ...     'machine.gears.g.teeth': 20, 'machine.gears.g.mate_shaft': 'output',
+    ...     'machine.gears.g.mate_teeth': 50})
+    >>> found['input.ratio'], found['input.mesh_orders']
+    (2.5, [20.0])
+    """
+    machine = Machine.among(given)
+    if not machine.shafts:
+        return {}
+    shafts = given.get('shafts') or list(machine.shafts)
+    found: dict[str, Any] = {'shafts': shafts, 'shaft': shafts[0]}
+    for shaft in shafts:
+        plain = [f'{shaft}.ratio', f'{shaft}.ratio_teeth'] + ['ratio'] * (len(shafts) == 1)
+        has_ratio = any(name in given for name in plain)
+        if shaft not in machine.shafts:
+            if has_ratio:
+                continue
+            raise ParameterError(f'shafts names {shaft}, which the machine does not have: give '
+                                 f'some of {", ".join(machine.shafts)}, or {shaft}.ratio')
+        orders, meshes = machine.average_orders(shaft), machine.mesh_orders(shaft)
+        values: dict[str, Any] = {} if has_ratio else {'ratio': machine.ratio(shaft)}
+        values |= {'orders': list(orders)} if orders else {}
+        values |= {'mesh_orders': list(meshes), 'teeth': int(meshes[0])} if meshes else {}
+        if given.get('averaging', 'block') == 'block':
+            values['bearing_orders'] = list(machine.strikes(shaft))
+        found |= {f'{shaft}.{name}': value for name, value in values.items()}
+        if len(shafts) == 1:
+            found |= {name: values[name] for name in ('ratio', 'orders') if name in values}
+    return found

@@ -23,16 +23,14 @@ change.
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, BoolArray, FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.evidence import below, ChangeEvidence, Kept, SIZES, threshold
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 #: Values of a baseline from which on new ones can be tested.
 LEAST_LEARNED = 8
@@ -262,7 +260,7 @@ class ChangeTest(Kept):
         return Estimate(total / sure, 1.0 / sure, base / sure, noise / sure, np.where(
             weight > 0.0, freedom, np.nan), doubt / sure)
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Array]:
         """Return what `restore` needs: arrays by names."""
         found = {**super().state(), 'bins': np.array(list(self.bins), np.int64)}
         for prefix, part in (('evidence', self.evidence), *(
@@ -270,7 +268,7 @@ class ChangeTest(Kept):
             found |= {f'{prefix}.{name}': item for name, item in part.state().items()}
         return found
 
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         """Go on from a state."""
         super().restore(state)
         self.evidence.restore(below(state, 'evidence.'))

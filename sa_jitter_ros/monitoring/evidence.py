@@ -24,13 +24,12 @@ Ramdas, Rinaldo 2023, "E-detectors"). It is more by the overshoot over A, whose 
 from collections.abc import Mapping
 from functools import lru_cache
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, BoolArray, FloatArray
 from scipy.special import ndtr
 
-FloatArray = NDArray[np.float64]
 
 #: Sizes of the changes that are looked for, in standard deviations of a score. Between two of them
 #: a change is found with a third more scores than at the best size. Smaller changes take so many
@@ -70,17 +69,17 @@ class Kept:
 
     KEPT: ClassVar[tuple[str, ...]] = ()
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Array]:
         """Return what `restore` needs: arrays by names."""
         return {name.lstrip('_'): getattr(self, name) for name in self.KEPT}
 
-    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, Array]) -> None:
         """Go on from a state."""
         for name in self.KEPT:
             setattr(self, name, state[name.lstrip('_')].copy())
 
 
-def below(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+def below(state: Mapping[str, Array], prefix: str) -> dict[str, Array]:
     """Return the arrays of a state whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): item for name, item in state.items()
             if name.startswith(prefix)}
@@ -100,9 +99,9 @@ class ChangeEvidence(Kept):
     def __init__(self, shape: tuple[int, int]) -> None:
         self.ratios: FloatArray = np.zeros((_TESTED, *shape))
         self.sums: FloatArray = np.zeros((len(SIZES), *shape))
-        self.tested: NDArray[np.bool_] = np.zeros(shape, np.bool_)
+        self.tested: BoolArray = np.zeros(shape, np.bool_)
 
-    def update(self, scores: FloatArray) -> NDArray[np.bool_]:
+    def update(self, scores: FloatArray) -> BoolArray:
         """
         Take the next scores (size, unit, quantity), NaN: none; return where no change has begun.
 
@@ -124,7 +123,7 @@ class ChangeEvidence(Kept):
         count = np.maximum(self.tested.sum(axis=1), 1)
         return np.asarray(self.ratios.sum(axis=(0, 2)) / (_TESTED * count))
 
-    def changed(self, level: float) -> NDArray[np.bool_]:
+    def changed(self, level: float) -> BoolArray:
         """
         Return which quantities (unit, quantity) have changed: of the units that reach the `level`.
 
@@ -136,7 +135,7 @@ class ChangeEvidence(Kept):
         least = np.minimum(alone, 0.5 * own.max(axis=1, keepdims=True))
         return np.asarray((self.mean() >= level)[:, None] & (own >= least))
 
-    def forget(self, which: NDArray[np.bool_]) -> None:
+    def forget(self, which: BoolArray) -> None:
         """Begin again for quantities (unit, quantity)."""
         self.ratios[:, which] = 0.0
         self.sums[:, which] = 0.0

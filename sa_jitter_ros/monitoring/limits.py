@@ -23,14 +23,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.indicators import INDICATORS
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import LEVELS, Limit, Machine
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
 from sa_jitter_ros.number_text import HALF_95, measured_text
 
-FloatArray = NDArray[np.float64]
 #: Of a number of channels, the names that a limit may call each.
 Labels = Callable[[int], Sequence[Sequence[str]]]
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
@@ -28,13 +28,9 @@ from sa_jitter_ros.monitoring.baseline_file import (
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingState
-from sa_jitter_ros.monitoring.quantities import Layout, monitored, MonitoredAverage
+from sa_jitter_ros.monitoring.quantities import KINDS, Layout, monitored, MonitoredAverage
 
-FloatArray = NDArray[np.float64]
 
-#: Topics of a shaft whose arrays make one average, by the names of their arrays.
-KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',
-         'envelope_amplitude')
 # Averages that wait for arrays that are on their way; older ones do without.
 _WAITING = 4
 # Averages without indicators after which a shaft is taken to have none.
@@ -90,8 +86,7 @@ class Pairing:
         left = parts[KINDS[0]].values[..., _ATTENUATION]
         if self._left is None or left.shape != self._left.shape or np.isfinite(left).any():
             self._left = left
-        return monitored(parts[KINDS[0]], *(parts.get(kind) for kind in KINDS[1:]),
-                         allow_uncorrected=self.allow_uncorrected, left=self._left)
+        return monitored(parts, allow_uncorrected=self.allow_uncorrected, left=self._left)
 
 
 class MachineMonitor:

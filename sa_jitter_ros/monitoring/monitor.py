@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine, UNKNOWN
@@ -28,10 +28,9 @@ from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
 from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
-from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.parameters import fixed, Parameter, Values
 from scipy import special
 
-FloatArray = NDArray[np.float64]
 
 YEAR = 365.25 * 86400.0  # s
 # Bins: the machine passes through more of them in a run-up than it stays in.
@@ -46,20 +45,18 @@ _FARTHEST = 4.0
 PARAMETERS = (
     Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of all '
               'tests together', above=0.0, maximum=1e4),
-    Parameter('learning_averages', 200, 'averages that a bin learns before it tests, at least '
-              f'{LEAST_LEARNED} groups', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
-    Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
-              maximum=10000, read_only=True),
+    fixed('learning_averages', 200, 'averages that a bin learns before it tests, at least '
+          f'{LEAST_LEARNED} groups', minimum=LEAST_LEARNED, maximum=10000000),
+    fixed('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
+          maximum=10000),
     Parameter('allow_uncorrected', False, 'take raw values without a correction; another '
               'keyphasor is then a change'),
-    Parameter('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
-              minimum=1e-4, maximum=1.0, read_only=True),
-    Parameter('state_bin', 0.0, 'width of a bin of the operating state; 0: one for all',
-              minimum=0.0, read_only=True),
-    Parameter('state_lowest', math.nan, 'averages at lower operating states are discarded; NaN: '
-              'none', read_only=True),
-    Parameter('state_highest', math.nan, 'averages at higher operating states are discarded; NaN: '
-              'none', read_only=True),
+    fixed('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
+          minimum=1e-4, maximum=1.0),
+    fixed('state_bin', 0.0, 'width of a bin of the operating state; 0: one for all', minimum=0.0),
+    fixed('state_lowest', math.nan, 'averages at lower operating states are discarded; NaN: none'),
+    fixed('state_highest', math.nan, 'averages at higher operating states are discarded; NaN: '
+          'none'),
 )
 
 
@@ -463,14 +460,14 @@ class ShaftMonitor:
 
     # --- state ---
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Array]:
         """Return what `restore` needs: arrays by names. Groups that are not full are left out."""
         return {**self._test.state(), 'products': self._products,
                 'intervals': np.array(self._intervals),
                 'place': np.array([self._bins.speed, self._bin, self._end, self.averages,
                                    self._bins.state])}
 
-    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+    def restore(self, state: dict[str, Array]) -> None:
         """Go on from a state; raises KeyError and ValueError for one of something else."""
         self._test.restore(state)
         if state['products'].shape != self._products.shape or (

@@ -18,19 +18,21 @@ moments, whose scatter is relative. So are bearing orders: by the depth of the m
 amplitude of the squared envelope over its mean, because both follow load and speed alike.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.averaging.results import (
     AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS)
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.machine import Machine
 
-FloatArray = NDArray[np.float64]
 
+#: Topics of a shaft whose arrays make one average, by the names of their arrays.
+KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',
+         'envelope_amplitude')
 # Power of the amplitude in the numerator of each indicator: a relative error of all amplitudes
 # changes the indicator by at most so many times as much.
 _POWERS = {'kurtosis': 4.0, 'fm4': 4.0, 'm6a': 6.0, 'm8a': 8.0, 'na4': 4.0, 'na4_star': 4.0,
@@ -139,12 +141,10 @@ class MonitoredAverage:
                        readings=readings)
 
 
-def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = None,
-              errors: AverageMessage | None = None, envelope: AverageMessage | None = None, *,
-              allow_uncorrected: bool = False, left: FloatArray | None = None
-              ) -> MonitoredAverage:
+def monitored(arrays: Mapping[str, AverageMessage], *, allow_uncorrected: bool = False,
+              left: FloatArray | None = None) -> MonitoredAverage:
     """
-    Return what is monitored of the arrays of one average.
+    Return what is monitored of the arrays of one average, by their topics in `KINDS`.
 
     Without corrected amplitudes, these and the indicators are unknown, because what is not
     corrected shows the keyphasor, too. With `allow_uncorrected` the raw ones, with their standard
@@ -152,6 +152,7 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
     what it has `left` (channel, order). Raises MessageError for arrays whose channels or
     indicators differ.
     """
+    amplitudes, indicators, errors, envelope = arrays[KINDS[0]], *map(arrays.get, KINDS[1:])
     table = amplitudes.values
     channels, count, _ = table.shape
     names = indicators.names if indicators is not None else ()
@@ -206,7 +207,7 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
         _readings(table, (values, variance), (amplitude / mean, (error / amplitude) ** 2)))
 
 
-def best_amplitudes(table: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+def best_amplitudes(table: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """
     Return amplitudes (..., order) of a table and their errors, the raw ones without a correction.
 

@@ -23,10 +23,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.monitoring.evidence import Kept, SIZES
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # No value counts more than one so many standard deviations off, as a score and in the baseline: a
 # single wild average is no change.

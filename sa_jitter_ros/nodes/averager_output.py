@@ -20,7 +20,6 @@ from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.monitoring.limits import LimitWatch
-from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import encode_average
@@ -58,8 +57,7 @@ class ShaftOutput:
         for kind, result in results.items():
             self._publishers[kind].publish(encode_average(kind, result))
         if self._limits.names:
-            self._limits.update(self._name, monitored(
-                results[KINDS[0]], *map(results.get, KINDS[1:])))
+            self._limits.update(self._name, monitored(results))
         since = average.end_time - self._summarised
         if not 0.0 <= since < pause and self._summary.get_subscription_count():
             self._summarised = average.end_time

@@ -40,8 +40,7 @@ from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import first_of, Flow, Health, Level
 from sa_jitter_ros.nodes.lifetime import end_within, InterruptOnce, SECONDS
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.nodes.parameters import ParameterSet
-from sa_jitter_ros.nodes.renaming import given_parameters
+from sa_jitter_ros.nodes.parameters import given_parameters, ParameterSet
 from sa_jitter_ros.parameter_file import require_regular_file
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 

@@ -24,15 +24,16 @@ from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.monitoring.limits import LimitWatch
-from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
+from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.monitoring.operating import OperatingState
+from sa_jitter_ros.monitoring.quantities import KINDS
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import first_of, Flow
 from sa_jitter_ros.nodes.messages import decode_average, known_type
 from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import (
-    HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
+    fixed, HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
 from sa_jitter_ros.recordings.channel_units import channels_of, scale_of
 from std_msgs.msg import Float64, Float64MultiArray, String
 
@@ -40,18 +41,16 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 STATE_TYPES: dict[str, type] = {
     'std_msgs/Float64': Float64, 'std_msgs/Float64MultiArray': Float64MultiArray}
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
+    fixed('shafts', ['shaft'], 'names of the shafts'),
     *TEST_PARAMETERS,
     Parameter('severe_change', 0.25, 'relative change that is an error, if larger by two standard '
               'errors; others are warnings', above=0.0, maximum=1e6),
-    Parameter('baseline_file', '', 'file of the baseline; empty: '
-              'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: not '
-              'kept', read_only=True),
+    fixed('baseline_file', '', 'file of the baseline; empty: '
+          'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: not kept'),
     Parameter('relearn', False, 'learn a new baseline; the old file is kept, with a number '
               'in its name'),
-    Parameter('operating_state_type', 'std_msgs/Float64', 'message type of operating_state; '
-              'std_msgs/Float64MultiArray is [time on the clock of the averages, value]',
-              read_only=True),
+    fixed('operating_state_type', 'std_msgs/Float64', 'message type of operating_state; '
+          'std_msgs/Float64MultiArray is [time on the clock of the averages, value]'),
 )
 _NOT_KEPT = 'none'
 _SAVE_PERIOD = 60.0  # s between writings of the file, unless something happens

@@ -10,7 +10,7 @@
 
 """Node `live_view`: a web page with the latest results of all nodes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 import json
 import math
@@ -29,20 +29,22 @@ from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, decode_residual, PREDICTION_FIELDS,
     RESIDUAL_FIELDS)
-from sa_jitter_ros.nodes.result_flows import ResultFlows
-from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
+from sa_jitter_ros.nodes.result_flows import AVERAGE, ResultFlows
+from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
 
 LARGEST_REPORT = 1_000_000  # characters of a text in JSON
+FLOWS = ('condition_indicator', 'pulse_error')  # results that come beside the average
+KINDS = ('synchronous_average', 'standard_error', 'corrected_average', AVERAGE, *FLOWS,
+         'condition_indicator_error')
 NODES, NODE_VALUES = 64, 100  # nodes whose diagnostics are shown, and values of each node
 
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'names of the shafts', read_only=True),
-    Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
-    Parameter('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
-              maximum=65535, read_only=True),
-    Parameter('open_to_network', False, 'allow a host that others reach, who then see '
-              'everything', read_only=True),
+    fixed('shafts', ['shaft'], 'names of the shafts'),
+    fixed('host', '127.0.0.1', 'address to listen on'),
+    fixed('port', 8420, 'port of the page, or the next free one; 0: any free port', minimum=0,
+          maximum=65535),
+    fixed('open_to_network', False, 'allow a host that others reach, who then see everything'),
     Parameter('vibration_unit', '', 'unit of the vibration on labels; empty: that of '
               'machine.channels'),
     Parameter('channel_names', [], 'names of the channels on labels; empty: those of '
@@ -54,48 +56,43 @@ class ShaftView:
     """Puts the results of one shaft on the board, with their histories."""
 
     def __init__(self, shaft: str, board: Board) -> None:
-        self._shaft, self._board = shaft, board
+        self.shaft, self._board = shaft, board
         self._errors, self._indicators = PulseErrors(), Trend()
         self._attenuations = History(HISTORY_NUMBERS, HISTORY)
         self._amplitudes = {'raw': Trend(), 'corrected': Trend()}
         self._maps = {'synchronous_average': OrderMap(), 'corrected_average': OrderMap()}
 
     def _put(self, kind: str, content: Any, *, by_channel: bool = False) -> None:
-        self._board.put(f'{self._shaft}/{kind}', content, by_channel=by_channel)
+        if content is not None:
+            self._board.put(f'{self.shaft}/{kind}', content, by_channel=by_channel)
 
-    def on_waveform(self, kind: str, message: Float64MultiArray) -> None:
-        """Show a waveform, and its spectrum if it is an average."""
-        average = decode_average(kind, message)
-        self._put(kind, partial(waveform_content, average))
+    def show(self, kind: str, average: AverageMessage) -> None:
+        """Show a result; `kind` is its topic."""
+        if kind == 'order_amplitude':
+            self._show_orders(average)
+        elif kind == 'pulse_error':
+            self._put(kind, partial(pulses_content, average, self._errors.add(average.values)))
+        elif kind.startswith('condition_indicator'):
+            self._put(kind, partial(indicators_content, average))
+            self._put('indicator_trend', self._indicator_trend(kind, average), by_channel=True)
+        else:
+            self._put(kind, partial(waveform_content, average))
         if kind in self._maps:
             self._put(f'{kind}_spectrum', partial(spectrum_content, average), by_channel=True)
-            content = self._maps[kind].add(average.header.end_time, average.values[:CHANNELS])
-            if content is not None:
-                self._put(f'{kind}_map', content, by_channel=True)
+            self._put(f'{kind}_map', self._maps[kind].add(
+                average.header.end_time, average.values[:CHANNELS]), by_channel=True)
 
-    def on_indicators(self, message: Float64MultiArray) -> AverageMessage:
-        """Show condition indicators and their trend; return the message."""
-        average = decode_average('condition_indicator', message)
-        self._put('condition_indicator', partial(indicators_content, average))
+    def _indicator_trend(self, kind: str, average: AverageMessage) -> Any:
+        """Return the trend with values, or with their errors, which come after them."""
         values = average.values[:CHANNELS, :INDICATORS]
-        if average.names:
-            self._put('indicator_trend', self._indicators.add(
-                average.header.end_time, average.names[:INDICATORS], values,
-                values * math.nan), by_channel=True)
-        return average
+        if kind == 'condition_indicator_error':
+            return self._indicators.amend(average.header.end_time, values)
+        return self._indicators.add(
+            average.header.end_time, average.names[:INDICATORS], values,
+            values * math.nan) if average.names else None
 
-    def on_indicator_errors(self, message: Float64MultiArray) -> None:
-        """Show the standard errors of condition indicators."""
-        average = decode_average('condition_indicator_error', message)
-        self._put('condition_indicator_error', partial(indicators_content, average))
-        content = self._indicators.amend(
-            average.header.end_time, average.values[:CHANNELS, :INDICATORS])
-        if content is not None:
-            self._put('indicator_trend', content, by_channel=True)
-
-    def on_orders(self, message: Float64MultiArray) -> AverageMessage:
-        """Show order amplitudes and their trend; return the message."""
-        average = decode_average('order_amplitude', message)
+    def _show_orders(self, average: AverageMessage) -> None:
+        """Show order amplitudes and their trend."""
         shown = average.values[:CHANNELS, :ORDERS]
         history = self._attenuations.add(
             average.header.end_time, shown[..., 0].tobytes(), shown[..., 5])
@@ -104,14 +101,6 @@ class ShaftView:
             self._put(f'{kind}_trend', trend.add(
                 average.header.end_time, tuple(f'{order:.6g}' for order in shown[0, :, 0]),
                 *amplitude_rows(shown, average.names, kind)), by_channel=True)
-        return average
-
-    def on_pulses(self, message: Float64MultiArray) -> AverageMessage:
-        """Show pulse errors; return the message."""
-        average = decode_average('pulse_error', message)
-        self._put('pulse_error', partial(
-            pulses_content, average, self._errors.add(average.values)))
-        return average
 
 
 class LiveView(MonitoringNode):
@@ -133,9 +122,11 @@ class LiveView(MonitoringNode):
         self._nodes: dict[str, dict[str, Any]] = {}
         self._apply(values)
         for shaft in values['shafts']:
-            self._watch_shaft(shaft)
-        self._flows = ResultFlows(
-            self, values['shafts'], ['condition_indicator', 'pulse_error'])
+            view = ShaftView(shaft, self._board)
+            for kind in KINDS:
+                self.create_input(Float64MultiArray, f'{shaft}/{kind}',
+                                  partial(self._on_result, view, kind), RESULT_QOS)
+        self._flows = ResultFlows(self, values['shafts'], FLOWS)
         self._prediction_flow, self._change_flow = (
             self.watch_input(name, name, f'see the status of the {node}', once=True, optional=True)
             for name, node in (('prediction', 'predictor'), ('change', 'change monitor')))
@@ -177,31 +168,17 @@ class LiveView(MonitoringNode):
 
     # --- messages ---
 
-    def _watch_shaft(self, shaft: str) -> None:
-        """Subscribe to the results of one shaft."""
-        view = ShaftView(shaft, self._board)
-
-        def on_orders(message: Float64MultiArray) -> None:
-            average = view.on_orders(message)
+    def _on_result(self, view: ShaftView, kind: str, message: Float64MultiArray) -> None:
+        average = decode_average(kind, message)
+        view.show(kind, average)
+        if kind in (AVERAGE, *FLOWS):
+            self._flows.came(view.shaft, kind, average)
+        if kind == AVERAGE:
             self._averages += 1
-            self._flows.came(shaft, 'order_amplitude', average)
             names, channels = self._labels['channel_names'], len(average.values)
             self.set_missing('names of the channels', (
-                f'channel_names has {len(names)} and {shaft} has {channels} channels: name each'
-                if names and len(names) != channels else ''))
-
-        def on_flow(kind: str, show: Callable[[Any], AverageMessage], message: Any) -> None:
-            self._flows.came(shaft, kind, show(message))
-
-        callbacks: dict[str, Callable[[Any], None]] = {
-            **{kind: partial(view.on_waveform, kind)
-               for kind in ('synchronous_average', 'standard_error', 'corrected_average')},
-            'order_amplitude': on_orders,
-            'pulse_error': partial(on_flow, 'pulse_error', view.on_pulses),
-            'condition_indicator': partial(on_flow, 'condition_indicator', view.on_indicators),
-            'condition_indicator_error': view.on_indicator_errors}
-        for kind, callback in callbacks.items():
-            self.create_input(Float64MultiArray, f'{shaft}/{kind}', callback, RESULT_QOS)
+                f'channel_names has {len(names)} and {view.shaft} has {channels} channels: name '
+                'each' if names and len(names) != channels else ''))
 
     def _on_prediction(self, topic: str, message: Float64MultiArray) -> None:
         prediction = decode_prediction(message)

@@ -25,12 +25,11 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, PredictionMessage, PULSE_ERROR_FIELDS, ResidualMessage)
 
-FloatArray = NDArray[np.float64]
 Json = Any
 
 # Largest numbers that are kept and shown:
@@ -130,7 +129,7 @@ class History:
         self._numbers, self._most, self._key = numbers, most, None
         self.rows: deque[tuple[Any, ...]] = deque()
 
-    def add(self, time: float, key: Any, *arrays: NDArray[Any]) -> list[tuple[Any, ...]]:
+    def add(self, time: float, key: Any, *arrays: Array) -> list[tuple[Any, ...]]:
         """Add the arrays of an average that ended at `time` (s); return all, with their times."""
         if key != self._key or (self.rows and time < self.rows[-1][0]):
             size = max(sum(array.size for array in arrays), 1)

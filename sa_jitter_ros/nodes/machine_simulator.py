@@ -23,7 +23,7 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, require_shaft_names, Values)
+    fixed, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, require_shaft_names, Values)
 from sa_jitter_ros.recordings.channel_units import scale_of
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.simulation import (
@@ -32,32 +32,28 @@ from sa_jitter_ros.simulation import (
 from sa_jitter_ros.simulation.effects import JITTER_DISTRIBUTIONS
 from sa_jitter_ros.simulation.random_streams import ZERO
 
-FIXED: dict[str, Any] = {'read_only': True}
 PARAMETERS = (
-    Parameter('seed', 0, 'seed of all random numbers', minimum=0, **FIXED),
-    Parameter('start_time', 0.0, 'time of the first sample', unit='s', **FIXED),
-    Parameter('duration', 0.0, 'machine time to simulate; 0: no end', unit='s', minimum=0.0,
-              **FIXED),
-    Parameter('sample_rate', 20000.0, 'sampling rate of the vibration', unit='Hz', above=0.0,
-              **FIXED),
-    Parameter('channel_gains', [1.0], 'gain of each vibration channel', **FIXED),
-    Parameter('shafts', ['shaft'], 'names of the shafts', **FIXED),
-    Parameter('speed', 25.0, 'speed of the tach shaft', unit='Hz', above=0.0, **FIXED),
-    Parameter('speed_profile', [], 'instead of speed: time (s), speed (Hz), time, speed, ...; '
-              'linear between', minimum=0.0, **FIXED),
-    Parameter('speed_fluctuation_std', 0.0, 'standard deviation of a random speed fluctuation, '
-              'relative', minimum=0.0, maximum=0.1, **FIXED),
-    Parameter('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of the '
-              'fluctuation', unit='Hz', above=0.0, **FIXED),
-    Parameter('torsion_order', 2.0, 'torsional oscillations per tach revolution', minimum=0.0,
-              **FIXED),
-    Parameter('torsion_amplitude', 0.0, 'amplitude of the torsional oscillation', unit='rad',
-              minimum=0.0, **FIXED),
+    fixed('seed', 0, 'seed of all random numbers', minimum=0),
+    fixed('start_time', 0.0, 'time of the first sample', unit='s'),
+    fixed('duration', 0.0, 'machine time to simulate; 0: no end', unit='s', minimum=0.0),
+    fixed('sample_rate', 20000.0, 'sampling rate of the vibration', unit='Hz', above=0.0),
+    fixed('channel_gains', [1.0], 'gain of each vibration channel'),
+    fixed('shafts', ['shaft'], 'names of the shafts'),
+    fixed('speed', 25.0, 'speed of the tach shaft', unit='Hz', above=0.0),
+    fixed('speed_profile', [], 'instead of speed: time (s), speed (Hz), time, speed, ...; linear '
+          'between', minimum=0.0),
+    fixed('speed_fluctuation_std', 0.0, 'standard deviation of a random speed fluctuation, '
+          'relative', minimum=0.0, maximum=0.1),
+    fixed('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of the fluctuation',
+          unit='Hz', above=0.0),
+    fixed('torsion_order', 2.0, 'torsional oscillations per tach revolution', minimum=0.0),
+    fixed('torsion_amplitude', 0.0, 'amplitude of the torsional oscillation', unit='rad',
+          minimum=0.0),
     Parameter('noise_std', 0.1, 'declared white noise per vibration sample', minimum=0.0),
-    Parameter('tach', 'pulses', 'output of the keyphasor',
-              choices=('pulses', 'waveform', 'both', 'none'), **FIXED),
-    replace(PULSES_PER_REVOLUTION, **FIXED),
-    replace(PULSES_PER_TRIGGER, **FIXED),
+    fixed('tach', 'pulses', 'output of the keyphasor',
+          choices=('pulses', 'waveform', 'both', 'none')),
+    replace(PULSES_PER_REVOLUTION, read_only=True),
+    replace(PULSES_PER_TRIGGER, read_only=True),
     Parameter('keyphasor_rate', 10000.0, 'sampling rate of the keyphasor', unit='Hz', above=0.0),
     Parameter('jitter_distribution', 'uniform', 'distribution of the declared pulse error; '
               'sampled: times rounded up to ticks of keyphasor_rate',
@@ -67,13 +63,11 @@ PARAMETERS = (
               unit='s', minimum=0.0),
     Parameter('jitter_table', [], 'equally likely pulse errors, for jitter_distribution table',
               unit='s'),
-    Parameter('waveform', 'ttl', 'shape of the tach waveform', choices=('ttl', 'sine'), **FIXED),
-    Parameter('waveform_rate', 50000.0, 'sampling rate of the tach waveform', unit='Hz',
-              above=0.0, **FIXED),
-    Parameter('waveform_rise_time', 0.0, 'rise time of a ttl edge', unit='s', minimum=0.0,
-              **FIXED),
-    Parameter('waveform_noise_std', 0.0, 'standard deviation of noise on the tach waveform of 0 '
-              'to 5 V', unit='V', minimum=0.0, **FIXED),
+    fixed('waveform', 'ttl', 'shape of the tach waveform', choices=('ttl', 'sine')),
+    fixed('waveform_rate', 50000.0, 'sampling rate of the tach waveform', unit='Hz', above=0.0),
+    fixed('waveform_rise_time', 0.0, 'rise time of a ttl edge', unit='s', minimum=0.0),
+    fixed('waveform_noise_std', 0.0, 'standard deviation of noise on the tach waveform of 0 to 5 '
+          'V', unit='V', minimum=0.0),
 )
 # Sizes at which an effect is significant as soon as it is enabled.
 EFFECT_DEFAULTS = {
@@ -90,13 +84,12 @@ EFFECT_DEFAULTS = {
 def simulated_shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     """Return the parameters of one shaft."""
     return (
-        Parameter(f'{shaft}.ratio', 1.0, 'speed over that of the tach shaft',
-                  above=0.0, **FIXED),
-        Parameter(f'{shaft}.teeth', 23, 'teeth of its gear: the mesh order', minimum=1, **FIXED),
-        Parameter(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and '
-                  'its multiples', minimum=0.0, **FIXED),
-        Parameter(f'{shaft}.sidebands', 0.2, 'relative amplitude of sidebands one order beside '
-                  'each multiple', minimum=0.0, **FIXED),
+        fixed(f'{shaft}.ratio', 1.0, 'speed over that of the tach shaft', above=0.0),
+        fixed(f'{shaft}.teeth', 23, 'teeth of its gear: the mesh order', minimum=1),
+        fixed(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and its '
+              'multiples', minimum=0.0),
+        fixed(f'{shaft}.sidebands', 0.2, 'relative amplitude of sidebands one order beside each '
+              'multiple', minimum=0.0),
         Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst of a chipped tooth, once '
                   'a revolution'),
     )

@@ -20,12 +20,13 @@ function; only this module knows their layouts. A message with another layout ra
 from __future__ import annotations
 
 import array
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields, MISSING
 import math
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging import results
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
@@ -36,7 +37,6 @@ from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
 
-FloatArray = NDArray[np.float64]
 ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 
 AMPLITUDE_FIELDS = results.AMPLITUDE_FIELDS
@@ -178,52 +178,52 @@ _AVERAGE_FIELDS = {
     'envelope_amplitude': ENVELOPE_FIELDS, 'envelope_spectrum': SPECTRUM_FIELDS}
 
 
-# Fields of the first version, by the last one of this version.
-_FIRST_FIELDS = {AMPLITUDE_FIELDS[-1]: 8, PULSE_ERROR_FIELDS[-1]: 3, PREDICTION_FIELDS[-1]: 7,
-                 GEOMETRY_FIELDS[-1]: 2, ENVELOPE_FIELDS[-1]: 5, SPECTRUM_FIELDS[-1]: 2,
-                 RESIDUAL_FIELDS[-1]: 6}
+# Number of fields of the first version, where it had fewer.
+_FIRST_FIELDS = {AMPLITUDE_FIELDS: 8, PULSE_ERROR_FIELDS: 3}
 
 
-def _decode_result(message: Any, labels: tuple[str, ...], header_size: int
-                   ) -> tuple[list[float], FloatArray, tuple[str, ...]]:
-    """Return header elements, NaN for those that an older writer lacks, values and names."""
-    header, values, names = decode_array(message, labels, None)
-    missing = [math.nan] * max(header_size - header.size, 0)
-    return header.tolist()[:header_size] + missing, values, names
+def _numbers(kind: type[Any], header: FloatArray) -> list[Any]:
+    """
+    Return header elements as the numbers of a dataclass, its counts whole.
+
+    Those that an older writer lacks are NaN, or what they are by default.
+    """
+    found = []
+    wanted = [item for item in fields(kind) if item.name != 'values']
+    for item, value in zip(wanted, [*header.tolist(), *[math.nan] * len(wanted)]):
+        if math.isnan(value) and item.default is not MISSING:
+            value = item.default
+        found.append(whole_number(item.name.replace('_', ' '), value)
+                     if item.type in ('int', int) else value)
+    return found
 
 
-def _with_fields(values: FloatArray, names: tuple[str, ...], fields: tuple[str, ...]
+def _with_fields(values: FloatArray, names: tuple[str, ...], known: tuple[str, ...]
                  ) -> FloatArray:
     """
     Return the known fields, by name where there are names, NaN for those that are missing.
 
     Without names there have to be those of the first version.
     """
-    if names == fields:
+    if names == known:
         return values
-    if not names and values.shape[-1] < _FIRST_FIELDS[fields[-1]]:
-        raise MessageError(f'{values.shape[-1]} fields received, {len(fields)} expected: '
-                           f'{", ".join(fields)}')
-    found = np.full((*values.shape[:-1], len(fields)), np.nan)
-    for place, name in enumerate(names or fields[:values.shape[-1]]):
-        if name in fields:
-            found[..., fields.index(name)] = values[..., place]
+    if not names and values.shape[-1] < _FIRST_FIELDS.get(known, len(known)):
+        raise MessageError(f'{values.shape[-1]} fields received, {len(known)} expected: '
+                           f'{", ".join(known)}')
+    found = np.full((*values.shape[:-1], len(known)), np.nan)
+    for place, name in enumerate(names or known[:values.shape[-1]]):
+        if name in known:
+            found[..., known.index(name)] = values[..., place]
     return found
 
 
 def decode_average(kind: str, message: Float64MultiArray) -> AverageMessage:
     """Decode an average's array, of this or another version; `kind` is the topic's name."""
-    header, values, names = _decode_result(message, _AVERAGE_LABELS[kind], 7)
+    header, values, names = decode_array(message, _AVERAGE_LABELS[kind], None)
     if kind in _AVERAGE_FIELDS:
         values = _with_fields(values, names, _AVERAGE_FIELDS[kind])
         names = _AVERAGE_FIELDS[kind]
-    start, end, sequence, cycles, fundamental, speed, discarded = header
-    return AverageMessage(
-        AverageHeader(start, end, whole_number('sequence', sequence),
-                      whole_number('trigger cycles', cycles),
-                      whole_number('fundamental cycles', fundamental), speed,
-                      0 if math.isnan(discarded) else whole_number('discarded cycles', discarded)),
-        values, names)
+    return AverageMessage(AverageHeader(*_numbers(AverageHeader, header)), values, names)
 
 
 def encode_geometry(geometry: MarkOffsets) -> Float64MultiArray:
@@ -235,34 +235,36 @@ def encode_geometry(geometry: MarkOffsets) -> Float64MultiArray:
 
 def decode_geometry(message: Float64MultiArray) -> MarkOffsets:
     """Decode where the marks of a target stand."""
-    header, values, names = _decode_result(message, ('mark', 'field'), 1)
+    header, values, names = decode_array(message, ('mark', 'field'), None)
     angles, errors = _with_fields(values, names, GEOMETRY_FIELDS).T
-    return MarkOffsets(angles, errors, header[0])
+    return MarkOffsets(angles, errors, header.tolist()[0] if header.size else math.nan)
+
+
+def _encode_orders(message: PredictionMessage | ResidualMessage, known: tuple[str, ...]
+                   ) -> Float64MultiArray:
+    return encode_array(message.values, ('order', f'field:{",".join(known)}'),
+                        astuple(message)[1:])
 
 
 def encode_prediction(prediction: PredictionMessage) -> Float64MultiArray:
     """Encode a prediction."""
-    return encode_array(prediction.values, ('order', f'field:{",".join(PREDICTION_FIELDS)}'),
-                        astuple(prediction)[1:])
+    return _encode_orders(prediction, PREDICTION_FIELDS)
 
 
 def decode_prediction(message: Float64MultiArray) -> PredictionMessage:
     """Decode a prediction."""
-    header, values, names = _decode_result(message, ('order', 'field'), 6)
-    speed, rate, cycles, ratio, pulse_error, noise = header
-    return PredictionMessage(_with_fields(values, names, PREDICTION_FIELDS), speed, rate,
-                             whole_number('trigger cycles', cycles), ratio, pulse_error, noise)
+    header, values, names = decode_array(message, ('order', 'field'), None)
+    return PredictionMessage(_with_fields(values, names, PREDICTION_FIELDS),
+                             *_numbers(PredictionMessage, header))
 
 
 def encode_residual(residual: ResidualMessage) -> Float64MultiArray:
     """Encode a residual."""
-    return encode_array(residual.values, ('order', f'field:{",".join(RESIDUAL_FIELDS)}'),
-                        astuple(residual)[1:])
+    return _encode_orders(residual, RESIDUAL_FIELDS)
 
 
 def decode_residual(message: Float64MultiArray) -> ResidualMessage:
     """Decode a residual."""
-    header, values, names = _decode_result(message, ('order', 'field'), 4)
-    count, chi2, p_value, rms = header
+    header, values, names = decode_array(message, ('order', 'field'), None)
     return ResidualMessage(_with_fields(values, names, RESIDUAL_FIELDS),
-                           whole_number('acquisitions', count), chi2, p_value, rms)
+                           *_numbers(ResidualMessage, header))

@@ -16,12 +16,17 @@ integer, a list of floats a list of integers, from `-p`, YAML and services) and 
 that match none. What is not given follows from the machine where it can (`following`). Before a
 change it calls `check` with all new values, which raises a `SaJitterError` to refuse the change;
 after the change it calls `apply`.
+
+rcl looks for the section of a file by the name that a node has after remapping, so that a renamed
+node would start with its defaults: `given_parameters` finds what rcl misses. A process of several
+nodes has a name too, which would rename all of them.
 """
 
 from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
 from itertools import pairwise
 import math
+from pathlib import Path
 import re
 from typing import Any
 
@@ -31,9 +36,11 @@ from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.machine import following, Machine, PREFIX
-from sa_jitter_ros.parameter_file import value_of
+from sa_jitter_ros.parameter_file import named_parameters, value_of
 from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.recordings.channel_units import channel_parameters, Channels, channels_of
+
+_RULE = re.compile(r'(?:(.*):)?__(?:node|name):=(.*)')  # that renames a node, or all
 
 
 def descriptor_of(item: Parameter) -> ParameterDescriptor:
@@ -91,6 +98,42 @@ def command_line_parameters(args: Sequence[str], nodes: Collection[str] = ()
             except (ParameterError, TypeError):
                 continue  # rcl says what is wrong
     return found
+
+
+def common_name(args: Sequence[str]) -> tuple[list[str], str]:
+    """
+    Return arguments without the rules that rename every node, and the name that they give or ''.
+
+    >>> common_name(['--ros-args', '-r', '__node:=rig', '-r', '__ns:=/a', '-r', 'x:__node:=y'])
+    (['--ros-args', '-r', '__ns:=/a', '-r', 'x:__node:=y'], 'rig')
+    """
+    kept, name = list(args), ''
+    for place in range(len(args) - 2, -1, -1):
+        rule = _RULE.fullmatch(args[place + 1])
+        if args[place] in ('-r', '--remap') and rule and rule[1] is None:
+            name = rule[2]
+            del kept[place:place + 2]
+    return kept, name
+
+
+def given_parameters(node: str, args: Sequence[str], process: Sequence[str] = ()
+                     ) -> list[rclpy.parameter.Parameter]:
+    """
+    Return the parameters on a command line that rcl does not give to a node by itself.
+
+    rcl lets the section of a node in a file win over `-p` for all nodes, and knows neither the
+    section of a renamed node nor those of the names of its `process`. Without files rcl does all.
+    """
+    files = [Path(path) for option, path in pairwise(args) if option == '--params-file']
+    rules = [_RULE.fullmatch(rule) for option, rule in pairwise(args)
+             if option in ('-r', '--remap')]
+    name = next((rule[2] for rule in rules if rule and rule[1] in (None, node)), node)
+    found: dict[str, Any] = {}
+    for names in (*([(node,), (name,)] if name != node else []), *([process] if process else [])):
+        for path in files:
+            found |= named_parameters(path, names)
+    return ([rclpy.parameter.Parameter(key, value=value) for key, value in found.items()]
+            + command_line_parameters(args, (node, name) if found else ())) if files else []
 
 
 def require_node_name(parameter: str, name: str) -> None:

@@ -17,18 +17,17 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     encode_samples, encode_samples_float32, known_type, SAMPLE_TYPES)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter
 from sa_jitter_ros.nodes.signals import PulseOutput
-from sa_jitter_ros.parameters import Parameter, TACH_TYPE, Values
+from sa_jitter_ros.parameters import fixed, Parameter, TACH_TYPE, Values
 from sa_jitter_ros.samples import SampleBlock
 from std_msgs.msg import Float64MultiArray
 
-FloatArray = NDArray[np.float64]
 
 TRANSPORT_BYTES_PER_SECOND = 100e6
 MAX_LAG = 0.5  # s; a stream that lags more continues from now instead of catching up
@@ -37,18 +36,16 @@ PROGRESS_PERIOD = 5.0  # s between log lines on progress
 PLAYBACK_PARAMETERS = (
     Parameter('rate', 1.0, 'speed of playing over real time', above=0.0, maximum=1000.0),
     Parameter('playing', True, 'false: pause'),
-    Parameter('block_seconds', 0.05, 'length of a message; less if above message_bytes',
-              unit='s', minimum=0.001, maximum=1.0, read_only=True),
-    Parameter('message_bytes', 300_000, 'largest message; more only with config/fastdds.xml',
-              unit='B', minimum=10_000, maximum=16_000_000, read_only=True),
-    Parameter('wait_seconds', 3.0, 'longest wait for subscribers before the start', unit='s',
-              minimum=0.0, maximum=60.0, read_only=True),
-    Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
-              'tach_waveform; or std_msgs/Float32MultiArray',
-              read_only=True),
+    fixed('block_seconds', 0.05, 'length of a message; less if above message_bytes', unit='s',
+          minimum=0.001, maximum=1.0),
+    fixed('message_bytes', 300_000, 'largest message; more only with config/fastdds.xml', unit='B',
+          minimum=10_000, maximum=16_000_000),
+    fixed('wait_seconds', 3.0, 'longest wait for subscribers before the start', unit='s',
+          minimum=0.0, maximum=60.0),
+    fixed('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
+          'tach_waveform; or std_msgs/Float32MultiArray'),
     TACH_TYPE,
-    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the pulses',
-              read_only=True),
+    fixed('keyphasor', 'keyphasor', 'name of the keyphasor: source of the pulses'),
 )
 _WRITTEN_TYPES = {name: SAMPLE_TYPES[name] for name in SAMPLE_TYPES if 'MultiArray' in name}
 

@@ -17,41 +17,32 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
-from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.parameters import fixed, Parameter
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import usable_channels
 from sa_jitter_ros.recordings.channel_units import in_units, scale_of
 from sa_jitter_ros.recordings.fields import fields_of
+from sa_jitter_ros.recordings.reading import READ_PARAMETERS
 from sa_jitter_ros.samples import SampleBlock
 
-FloatArray = NDArray[np.float64]
 
 PARAMETERS = (
-    Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
+    fixed('recording', '', 'file or rosbag2 folder to play'),
     Parameter('loop', False, 'start again at the end; times and indices continue'),
-    Parameter('tach', 'auto', 'keyphasor to play; both: pulses and waveform; auto: the first of '
-              'pulses, waveform, reference',
-              choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'), read_only=True),
-    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: as '
-              'recorded', unit='Hz', minimum=0.0, read_only=True),
-    Parameter('recorded_keyphasor', '', 'keyphasor to play, of several in a bag; empty: the first',
-              read_only=True),
-    Parameter('acquisition', 0, 'acquisition to play, of several in a file', minimum=0,
-              read_only=True),
-    Parameter('sample_rate', 0.0, 'sampling rate of the vibration, if not in the file',
-              unit='Hz', minimum=0.0, read_only=True),
-    Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of '
-              'a bag; empty: all but the tach', element=str, read_only=True),
-    Parameter('tach_channel', '', 'name or number of the tach waveform', read_only=True),
-    Parameter('time_column', '', 'name or number of the column of times in a .csv',
-              read_only=True),
-    Parameter('fields', [], 'NAME=KEY: the key that the file has for a field; or NAME=VALUE',
-              element=str, read_only=True),
+    fixed('tach', 'auto', 'keyphasor to play; both: pulses and waveform; auto: the first of '
+          'pulses, waveform, reference',
+          choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none')),
+    fixed('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: as recorded',
+          unit='Hz', minimum=0.0),
+    fixed('recorded_keyphasor', '', 'keyphasor to play, of several in a bag; empty: the first'),
+    *READ_PARAMETERS,
+    fixed('fields', [], 'NAME=KEY: the key that the file has for a field; or NAME=VALUE',
+          element=str),
 )
 
 
@@ -64,12 +55,9 @@ class RecordingPlayer(PlaybackNode):
         if not values['recording']:
             raise ParameterError('no recording is given: set the parameter recording to a file, '
                                  'as in --ros-args -p recording:=rig.npz')
-        fields: Values = {'sample_rate': values['sample_rate'] or None,
-                          **fields_of(values['fields'])}
-        recording = read(
-            values['recording'], keyphasor=values['recorded_keyphasor'], **fields,
-            **{name: values[name] for name in (
-                'acquisition', 'vibration_channels', 'tach_channel', 'time_column')})
+        given = {item.name: values[item.name] for item in READ_PARAMETERS if values[item.name]}
+        recording = read(values['recording'], keyphasor=values['recorded_keyphasor'],
+                         **{**given, **fields_of(values['fields'])})
         channels = self.parameters.declare_channels()
         # It is played as it is; who takes it brings it into units, by the order of the channels.
         units, count = recording.units, recording.channels

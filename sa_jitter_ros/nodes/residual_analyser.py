@@ -11,6 +11,7 @@
 """Node `residual_analyser`: compares measured with predicted attenuation and finds its cause."""
 
 from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent import futures
 from dataclasses import replace
 from functools import partial
 import json
@@ -37,7 +38,7 @@ from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode
                                           encode_residual, ResidualMessage)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name
 from sa_jitter_ros.nodes.result_flows import ResultFlows
-from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
+from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
 from std_msgs.msg import Float64MultiArray, String
@@ -47,9 +48,9 @@ Found = TypeVar('Found')
 Waiting = Generator[None, None, Found]
 
 PARAMETERS = (
-    Parameter('shaft', 'shaft', 'shaft whose averages are compared', read_only=True),
-    Parameter('predictor', 'jitter_predictor', 'node whose predictions are compared and whose '
-              'effects are set', read_only=True),
+    fixed('shaft', 'shaft', 'shaft whose averages are compared'),
+    fixed('predictor', 'jitter_predictor', 'node whose predictions are compared and whose effects '
+          'are set'),
     Parameter('acquisitions', 20, 'averages compared at once; at least 4 to find a missing effect',
               minimum=2, maximum=10000),
     Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),
@@ -244,15 +245,17 @@ class ResidualAnalyser(MonitoringNode):
                effects: Sequence[Effect]) -> Waiting[None]:
         """Trace in a thread, that the executor goes on; with `close_loop`, set what it finds."""
         name_of = partial(self.parameters.machine.name_of, self._values['shaft'])
-        job = _Job(partial(trace_averages, averages, model, declared=effects, name_of=name_of))
+        job = _in_thread(partial(
+            trace_averages, averages, model, declared=effects, name_of=name_of))
         self._activity = 'tracing'
-        while job.thread.is_alive():
+        while not job.done():
             yield
-        trace = job.result
-        if trace is None:
+        if error := job.exception():
             self._untraced += len(averages)
-            self.warn(f'the cause of the residual could not be searched: {job.error}')
+            self.warn('the cause of the residual could not be searched: '
+                      f'{error if isinstance(error, SaJitterError) else repr(error)}')
             return
+        trace = job.result()
         content = report(trace)
         self._untraced += len(averages) - sum(content['acquisitions'].values())
         self._verdict = content['verdict']
@@ -336,23 +339,17 @@ class ResidualAnalyser(MonitoringNode):
         return f'{count} of {size} averages; {activity}', values
 
 
-class _Job:
-    """Work in a daemon thread; when it has ended there is a `result` or an `error`."""
+def _in_thread(work: Callable[[], Trace]) -> 'futures.Future[Trace]':
+    """Do work in a daemon thread; a bug in it must not stop the node."""
+    job: futures.Future[Trace] = futures.Future()
 
-    def __init__(self, work: Callable[[], Trace]) -> None:
-        self.result: Trace | None = None
-        self.error = ''
-        self._work = work
-        self.thread = threading.Thread(target=self._run, daemon=True)
-        self.thread.start()
-
-    def _run(self) -> None:
+    def run() -> None:
         try:
-            self.result = self._work()
-        except SaJitterError as error:
-            self.error = str(error)
-        except Exception as error:  # a bug in the trace must not stop the node
-            self.error = repr(error)
+            job.set_result(work())
+        except Exception as error:
+            job.set_exception(error)
+    threading.Thread(target=run, daemon=True).start()
+    return job
 
 
 def _resolved(pulses: NDArray[np.float64] | None) -> bool:

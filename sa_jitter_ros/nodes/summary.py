@@ -16,7 +16,7 @@ import math
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.errors import MessageError
@@ -27,7 +27,6 @@ from sa_jitter_ros.number_text import HALF_95, measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
 
-FloatArray = NDArray[np.float64]
 
 _ORDERS = 10  # the strongest ones
 _STATUS = dict(zip(('', *LEVELS), (

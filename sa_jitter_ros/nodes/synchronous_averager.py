@@ -16,7 +16,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings,
@@ -37,7 +37,6 @@ from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings.channel_units import channels_of
 from std_msgs.msg import Float64, Float64MultiArray
 
-FloatArray = NDArray[np.float64]
 
 _LATEST = 6  # averages that tell whether orders hold lines
 _SUMMARY_PAUSE = 1.0  # s between summaries of averages that come once a trigger cycle

@@ -17,21 +17,19 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
-from sa_jitter_ros.nodes.joint_input import JointInput
 from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES
-from sa_jitter_ros.nodes.signals import PulseOutput, SampleInput
+from sa_jitter_ros.nodes.signals import JointInput, PulseOutput, SampleInput
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, sample_parameters, TACH_TYPE, Values)
+    fixed, Parameter, PULSES_PER_REVOLUTION, sample_parameters, TACH_TYPE, Values)
 from sa_jitter_ros.pulses.detection import detector_of
 from sa_jitter_ros.pulses.detector_parameters import DECISIVE, DETECTOR_PARAMETERS
 from sensor_msgs.msg import JointState
 
-FloatArray = NDArray[np.float64]
 
 # Once the state levels are learnt, the detector finds all pulses of the window. Subscribers
 # queue 200 messages and may be busy with an average: the pulses are published in portions.
@@ -44,15 +42,12 @@ JOINT_TYPE = 'sensor_msgs/JointState'
 PARAMETERS = (
     *sample_parameters('tach_waveform'),
     TACH_TYPE,
-    Parameter('tach_waveform_type', '', 'message type of tach_waveform; empty: that of '
-              f'vibration_type; {JOINT_TYPE}: its positions (rad) give the pulses',
-              read_only=True),
-    Parameter('joint', '', f'joint of {JOINT_TYPE} to follow; '
-              'empty: the only one', read_only=True),
+    fixed('tach_waveform_type', '', 'message type of tach_waveform; empty: that of '
+          f'vibration_type; {JOINT_TYPE}: its positions (rad) give the pulses'),
+    fixed('joint', '', f'joint of {JOINT_TYPE} to follow; ' 'empty: the only one'),
     replace(PULSES_PER_REVOLUTION, read_only=True, description='marks on a revolution of the '
             'joint, one at angle 0'),
-    Parameter('imu_axis', 'z', 'axis of linear acceleration',
-              choices=('x', 'y', 'z'), read_only=True),
+    fixed('imu_axis', 'z', 'axis of linear acceleration', choices=('x', 'y', 'z')),
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the pulses'),
     *DETECTOR_PARAMETERS,
 )

@@ -8,24 +8,37 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Figures of averages: waveform of the latest one, and orders with their attenuation."""
+"""Figures of averages: waveform of the latest one, orders with attenuation, tracked orders."""
+
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.monitoring.quantities import Layout
+from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    Array, CORRECTED, heading, legend_under, MEASURED, RAW, rows_of_channels, strongest_channels)
+    CORRECTED, draw_limits, heading, legend_under, MEASURED, RAW, rows_of_channels, speed_varies,
+    strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _UNKNOWN = 0.3  # standard error of an attenuation that says nothing
+_FEWEST_TRACKED = 2  # averages
+_MOST_TRACKED = 6
+_CLEAR = 3.0  # amplitude over its noise, from which on an order has a phase
 
 
 def waveform_figure(signals: Signals, series: ShaftSeries) -> Figure:
     """Draw the latest synchronous average of the strongest channels over the angle."""
     channels = strongest_channels(series)
-    figure, panels = rows_of_channels(signals, channels)
     angle, raw = 360.0 * series['angle'], series['waveform'][-1]
+    shown = f'{len(channels)} strongest of {raw.shape[0]} channels, ' if (
+        raw.shape[0] > len(channels)) else ''
+    figure, panels = rows_of_channels(signals, series, channels, (
+        f'{shown}last average, {series["fundamental_cycles"][-1]:.0f} revolutions, tach shaft at '
+        f'{series["trigger_speed"][-1]:.4g} Hz'), 'angle of the shaft [degrees]')
     error = 2.0 * series['standard_error'][-1]
     for axes, channel in zip(panels[:, 0], channels):
         axes.fill_between(angle, raw[channel] - error[channel], raw[channel] + error[channel],
@@ -35,12 +48,6 @@ def waveform_figure(signals: Signals, series: ShaftSeries) -> Figure:
             axes.plot(angle, series['corrected_average'][-1, channel], color=CORRECTED,
                       linewidth=0.8, label='corrected')
         axes.margins(x=0.0)
-    shown = f'{len(channels)} strongest of {raw.shape[0]} channels, ' if (
-        raw.shape[0] > len(channels)) else ''
-    figure.suptitle(heading(signals, series, (
-        f'{shown}last average, {series["fundamental_cycles"][-1]:.0f} revolutions, tach shaft at '
-        f'{series["trigger_speed"][-1]:.4g} Hz')), fontsize='medium')
-    panels[-1, 0].set_xlabel('angle of the shaft [degrees]')
     legend_under(panels[-1, 0])
     return figure
 
@@ -115,3 +122,61 @@ def _stems(axes: Axes, position: Array, values: Array, color: str, label: str) -
     spread[known] = np.nanstd(values[:, known], axis=0)
     axes.errorbar(position, mean, yerr=np.minimum(spread, 0.9 * mean), fmt='o', color=color,
                   markersize=4.0, capsize=3.0, label=f'{label}: mean, scatter of the averages')
+
+
+def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | None:
+    """Draw the strongest of the tracked orders, each on its strongest channel."""
+    if len(series) < _FEWEST_TRACKED:
+        return None
+    kind = 'corrected' if np.isfinite(series.field('corrected_amplitude')).any() else 'raw'
+    amplitude, phase = (on_strongest(series, f'{kind}_{name}') for name in ('amplitude', 'phase'))
+    error = on_strongest(series, f'{kind}_standard_error')
+    noise = on_strongest(series, 'noise_standard_deviation')
+    error = np.where(np.isfinite(error), error, noise)
+    size = np.sqrt(np.nan_to_num(np.square(amplitude)).mean(axis=0))
+    chosen = np.sort(np.argsort(-size)[:_MOST_TRACKED])
+    time = 0.5 * (series['start_time'] + series['end_time'])
+    columns: list[tuple[str, Array]] = [('time [s]', time)]
+    if speed_varies(series):
+        columns.append(('speed of the tach shaft [Hz]', series['trigger_speed']))
+    figure = Figure(figsize=(9.0, 6.4), layout='constrained')
+    panels = figure.subplots(2, len(columns), sharex='col', sharey='row', squeeze=False)
+    channels = strongest_lines(series)
+    layout = Layout(len(signals.channels), tuple(series.orders.tolist()))
+    names = [order_words(order, signals.machine.name_of(series.shaft, order))
+             for order in series.orders.tolist()]
+    for number, (label, place) in enumerate(columns):
+        for colour, order in enumerate(chosen.tolist()):
+            _draw(panels[0, number], panels[1, number], place, amplitude[:, order],
+                  error[:, order], _phase(phase[:, order], amplitude[:, order], noise[:, order]),
+                  color=f'C{colour}', label=f'{names[order]}, '
+                  f'{signals.channel_names[channels[order]]}')
+            draw_limits(panels[0, number], [
+                (level, bound) for level, bound, relative in signals.limits.bounds(
+                    series.shaft, layout, int(channels[order]), order) if not relative],
+                names[order])
+        panels[1, number].set_xlabel(label)
+    units = {signals.units[channels[order]] for order in chosen.tolist()}
+    panels[0, 0].set_ylabel(f'{kind} amplitude [{" / ".join(sorted(units)) or "unit unknown"}]')
+    panels[1, 0].set_ylabel('phase [degrees]')
+    panels[0, 0].set_ylim(bottom=0.0)
+    figure.suptitle(heading(signals, series, 'tracked orders, ± 1 standard error'),
+                    fontsize='medium')
+    figure.legend(*panels[-1, 0].get_legend_handles_labels(), loc='outside lower center', ncols=2,
+                  fontsize='small', frameon=False)
+    return figure
+
+
+def _phase(phase: Array, amplitude: Array, noise: Array) -> Array:
+    """Return the phase in degrees, continued from average to average; NaN where noise hides it."""
+    clear = np.isfinite(phase) & (amplitude > _CLEAR * noise)
+    found = np.full(phase.shape, np.nan)
+    found[clear] = np.degrees(np.unwrap(phase[clear]))
+    return found
+
+
+def _draw(top: Axes, bottom: Axes, place: Array, amplitude: Array, error: Array, phase: Array, *,
+          color: str, label: str) -> None:
+    style: dict[str, Any] = {'color': color, 'marker': '.', 'markersize': 4.0, 'linewidth': 0.8}
+    top.errorbar(place, amplitude, yerr=error, elinewidth=0.8, label=label, **style)
+    bottom.plot(place, phase, label=label, **style)

@@ -11,25 +11,22 @@
 """One recording: its averages in files, by a function of a job that any process can do."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
 from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
-from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
-from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, read_about, RecordingJob, RecordingRow, row_values, Signals, stamp,
-    write_averages)
+    finished_together, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals,
+    TABLE, write_averages, write_rows)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -40,34 +37,29 @@ from sa_jitter_ros.recordings.channel_check import (
     channel_faults, fault_texts, is_lost, without_channels)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
-from sa_jitter_ros.tacholess.recording import Tacholess
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 
-FOUND = 'found_pulses.npz'
+FOUND, RECORDINGS = 'found_pulses.npz', 'recordings.csv'
 _VERSION = 5  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AverageJob(RecordingJob):
     """
     One recording to average.
 
-    `options` are keywords of `read`; `fields` among them are those that the user gave. The channel
-    `state`, a name or a number, may be constant. With `tacholess` the pulses are found in the
-    vibration.
+    `fields` among the options are those that the user gave. The channel `state`, a name or a
+    number, may be constant.
     """
 
     machine: MachineFile
-    options: Mapping[str, Any] = field(default_factory=dict)
     fields: tuple[str, ...] = ()
     figures: bool = True
     state: str = ''
-    tacholess: Tacholess | None = None
 
 
 @dataclass(frozen=True)
@@ -179,8 +171,7 @@ class RecordingAverager:
                     results['order_amplitude'], self._found.correct(average, ratio=(
                         settings.cycle_length / settings.revolutions_per_trigger)))
             if self.limits.names:
-                self.passed += self.limits.update(name, monitored(
-                    results[KINDS[0]], *map(results.get, KINDS[1:])))
+                self.passed += self.limits.update(name, monitored(results))
             yield name, results, average.refused
 
 
@@ -208,22 +199,16 @@ def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
     cannot be written.
     """
     try:
-        settings = _settings(job)
+        machine = job.machine
+        settings = job.settings(
+            version=_VERSION, figures=job.figures, state=job.state, averager=machine.averager,
+            detector=machine.detector, machine=machine.parts, hardware_id=machine.hardware_id)
         done = read_about(Path(job.folder))
         if done is not None and done.get('settings') == settings:
             return Row(**row_values(done['row']))
         return _averaged(job, settings, progress)
     except SaJitterError as error:
         return Row(job.name, job.path, error=str(error))
-
-
-def _settings(job: AverageJob) -> dict[str, Any]:
-    """Return all that decides the files, as values of JSON; raises RecordingError."""
-    return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
-            'figures': job.figures, 'state': job.state, 'options': json_values(job.options),
-            'averager': dict(job.machine.averager), 'hardware_id': job.machine.hardware_id,
-            'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector),
-            'tacholess': job.tacholess and json_values(asdict(job.tacholess))}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:
@@ -294,3 +279,15 @@ def _counted(row: Row, averager: RecordingAverager, series: list[ShaftSeries]) -
         trigger_cycles=averager.stream.counts.cycles, corrections_refused=averager.refused,
         cycles_dropped=totals['cycles_dropped'], pulses_dropped=totals['pulses_dropped'],
         samples_dropped=totals['samples_dropped'], gaps=totals['gaps'])
+
+
+def write_tables(output: Path, rows: Sequence[Row]) -> None:
+    """
+    Write `averages.csv` and `recordings.csv` beside the folders of the recordings.
+
+    A recording that ended early, or could not be averaged, has a row with the reason in both.
+    Raises OSError.
+    """
+    ordered = write_rows(output / RECORDINGS, rows)
+    join_tables(output / TABLE, [output / row.recording for row in ordered if row.averages],
+                [(row.recording, row.error) for row in ordered if row.error])

@@ -15,10 +15,11 @@ from collections.abc import Mapping
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.monitoring.monitor import ShaftMonitor
 from sa_jitter_ros.offline.changes import Changes, Key, key_of
-from sa_jitter_ros.offline.plotting import Array, draw_limits, legend_under, MARK, MEASURED
+from sa_jitter_ros.offline.plotting import draw_limits, legend_under, MARK, MEASURED
 
 _PANELS = 6
 _MOST_TICKS = 12

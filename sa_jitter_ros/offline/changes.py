@@ -19,26 +19,25 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.averaging.results import AverageHeader, AverageMessage
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import memory_of
 from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
-from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingBins
-from sa_jitter_ros.monitoring.quantities import (
-    mean_of, monitored, MonitoredAverage)
-from sa_jitter_ros.offline.files import ARRAYS
+from sa_jitter_ros.monitoring.quantities import KINDS, mean_of, monitored, MonitoredAverage
+from sa_jitter_ros.offline.files import read_averages, Signals, waveforms, write_lines
+from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.offline.settings import section
 from sa_jitter_ros.parameter_file import value_of
+from sa_jitter_ros.parameters import listed
 
 CHANGES, FIGURE = 'changes.json', 'changes.png'
 MONITOR = 'change_monitor'
@@ -49,10 +48,6 @@ SETTINGS = {item.name: item for item in PARAMETERS if item.name in (
 Key = tuple[str, int, str, str]  # shaft, channel, kind and name of a quantity
 _INTERVAL = 86400.0  # s between recordings that do not say their time
 _MOST_LINES = 6
-# Fields of `AverageHeader`, and ends of the names of names, as they are in `averages.npz`.
-_HEADER = ('start_time', 'end_time', 'sequence', 'trigger_cycles', 'fundamental_cycles',
-           'trigger_speed', 'discarded_cycles')
-_NAMES = ('_names', '_fields')
 
 
 @dataclass(frozen=True)
@@ -124,6 +119,14 @@ class Changes:
             'left_out': dict(self.left_out)})
         return found
 
+    def write(self, output: Path, *, figure: bool) -> None:
+        """Write `changes.json`, and `changes.png` with a `figure`; raises OSError."""
+        text = json.dumps(self.report(), indent=1, allow_nan=False)
+        write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
+        if figure:
+            from sa_jitter_ros.offline.change_figure import changes_figure
+            changes_figure(self).savefig(output / FIGURE, dpi=110)
+
     def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
         return {**item.content(), 'channel': self.recordings[0].channels[item.channel],
                 'since_recording': self.since(item), 'found_recording': found}
@@ -190,10 +193,10 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings,
     operating state; it is not monitored itself.
     Raises RecordingError if too few of them can be compared.
     """
-    tables = {name: _tables(output / name / ARRAYS, state) for name in names}
-    orders = _common_orders(tables.values())
-    recorded = [_recorded(name, arrays, orders, settings, state)
-                for name, arrays in tables.items()]
+    averaged = [read_averages(output / name) for name in names]
+    orders = _common_orders(series for _, series, _ in averaged)
+    recorded = [_recorded(output, name, signals, series, orders, settings, state)
+                for name, (signals, series, _) in zip(names, averaged)]
     left_out = {item.name: item.reason for item in recorded if item.reason}
     recorded = [item for item in recorded if not item.reason]
     if not recorded:
@@ -201,8 +204,8 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings,
     usual, _ = Counter(item.channels for item in recorded).most_common(1)[0]
     for item in recorded:
         if item.channels != usual:
-            left_out[item.name] = (f'has the channels {_listed(item.channels)}, most have '
-                                   f'{_listed(usual)}')
+            left_out[item.name] = (f'has the channels {listed(item.channels)}, most have '
+                                   f'{listed(usual)}')
     recorded = [item for item in recorded if item.name not in left_out]
     apart = _in_time(recorded)
     recorded = apart or recorded
@@ -243,76 +246,46 @@ def _baseline(recorded: Sequence[Recorded], settings: Settings) -> tuple[bool, .
                  for place, key in enumerate(bins))
 
 
-def _tables(path: Path, state: str) -> dict[str, NDArray[Any]]:
-    """
-    Return the arrays of a recording, without those over the angle.
-
-    The channel `state` is taken out, if there is one, and its means are in `<shaft>_state`.
-    """
-    with np.load(path) as arrays:
-        found = {name: arrays[name] for name in arrays.files if name.endswith(
-            (*KINDS, *_HEADER, *_NAMES)) or name in ('shafts', 'channels', 'units')}
-        labels = zip(found['channels'].tolist(), found['channel_names'].tolist())
-        for place, label in enumerate(labels):
-            if state and state in map(str, label):
-                for shaft in found['shafts'].tolist():
-                    found[f'{shaft}_state'] = arrays[f'{shaft}_waveform'][:, place].mean(axis=-1)
-                for name in found.keys() & {'channels', 'channel_names', 'units'}:
-                    found[name] = np.delete(found[name], place)
-                for name in [name for name in found if name.endswith(KINDS)]:
-                    found[name] = np.delete(found[name], place, axis=1)
-                break
-    return found
-
-
-def _common_orders(tables: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, list[float]]:
+def _common_orders(averaged: Iterable[Sequence[ShaftSeries]]) -> dict[str, list[float]]:
     """Return the orders of each shaft that all recordings have."""
     found: dict[str, list[float]] = {}
-    for arrays in tables:
-        for shaft in arrays['shafts'].tolist():
-            own = arrays[f'{shaft}_order_amplitude'][0, 0, :, 0].tolist()
-            found[shaft] = [order for order in found.get(shaft, own) if order in own]
+    for series in averaged:
+        for item in series:
+            own = item.orders.tolist()
+            found[item.shaft] = [order for order in found.get(item.shaft, own) if order in own]
     return found
 
 
-def _recorded(name: str, arrays: Mapping[str, NDArray[Any]], orders: Mapping[str, list[float]],
-              settings: Settings, state: str) -> Recorded:
+def _recorded(output: Path, name: str, signals: Signals, series: Sequence[ShaftSeries],
+              orders: Mapping[str, list[float]], settings: Settings, state: str) -> Recorded:
+    """Return the means of the averages of a recording, in which one channel is the `state`."""
+    labels = zip(map(str, signals.channels), signals.channel_names)
+    place = next((k for k, label in enumerate(labels) if state and state in label), None)
+    kept = [k for k in range(len(signals.channels)) if k != place]
     means: dict[str, MonitoredAverage] = {}
     discarded, refusal = 0, f'has no channel {state}'
-    for shaft in arrays['shafts'].tolist():
-        tables = {kind: arrays[f'{shaft}_{kind}'] for kind in KINDS if f'{shaft}_{kind}' in arrays}
-        labels = {kind: next(tuple(arrays[f'{shaft}_{kind}{name}'].tolist()) for name in _NAMES
-                             if f'{shaft}_{kind}{name}' in arrays) for kind in tables}
-        common = np.isin(tables[KINDS[0]][0, 0, :, 0], orders[shaft])
-        tables[KINDS[0]] = tables[KINDS[0]][:, :, common]
-        headers = [AverageHeader(*row) for row in zip(*(
-            arrays[f'{shaft}_{part}'].tolist() for part in _HEADER))]
-        parts = [{kind: AverageMessage(header, table[place], labels[kind])
-                  for kind, table in tables.items()} for place, header in enumerate(headers)]
-        averages = [
-            monitored(part[KINDS[0]], *(part.get(kind) for kind in KINDS[1:]),
-                      allow_uncorrected=settings.allow_uncorrected) for part in parts]
+    for item in series:
+        averages = [monitored(parts, allow_uncorrected=settings.allow_uncorrected)
+                    for parts in item.messages(KINDS, kept, np.array(orders[item.shaft]))]
         if state:
-            averages = [replace(item, state=float(value)) for item, value in zip(
-                averages, arrays.get(f'{shaft}_state', ()))]
-        kept = [item for item in averages if not settings.refusal(item.state)]
-        discarded += len(averages) - len(kept)
-        if kept:
-            means[shaft] = mean_of(kept)
+            values = () if place is None else waveforms(output / name, item.shaft)[:, place]
+            averages = [replace(average, state=float(value.mean()))
+                        for average, value in zip(averages, values)]
+        counted = [average for average in averages if not settings.refusal(average.state)]
+        discarded += len(averages) - len(counted)
+        if counted:
+            means[item.shaft] = mean_of(counted)
         elif averages:
             refusal = f'has no average that counts: {settings.refusal(averages[-1].state)}'
-    channels = tuple(arrays['channels'].tolist())
     first = next(iter(means.values()), None)
+    channels = tuple(signals.channels[k] for k in kept)
+    names, units = (tuple(values[k] for k in kept)
+                    for values in (signals.channel_names, signals.units))
     return Recorded(
-        name, float(arrays['start_time'][0]), float(arrays['end_time'][-1]),
+        name, float(series[0]['start_time'][0]), float(series[0]['end_time'][-1]),
         math.nan if first is None else first.header.mean_trigger_speed, channels, means,
-        tuple(arrays['units'].tolist()), tuple(arrays['channel_names'].tolist()),
-        math.nan if first is None else first.state, discarded,
+        units, names, math.nan if first is None else first.state, discarded,
         refusal if first is None else '' if channels else f'has no channel beside {state}')
-
-
-def _listed(channels: Sequence[int]) -> str:
-    return ', '.join(map(str, channels))
 
 
 def _in_time(recorded: Sequence[Recorded]) -> list[Recorded]:

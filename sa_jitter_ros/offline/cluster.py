@@ -16,7 +16,7 @@ from concurrent.futures import CancelledError
 import logging
 from typing import Any, TypeVar
 
-from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.errors import one_line, ParameterError, SaJitterError
 from sa_jitter_ros.offline.processes import attempt, Failure
 
 Job = TypeVar('Job')
@@ -57,7 +57,7 @@ def run_on_cluster(function: Callable[[Job], Result], jobs: Sequence[Job], addre
                 raise ParameterError(f'--scheduler {address}: its workers cannot import this '
                                      f'package ({error}): install it there') from None
             except Exception as error:  # a job that kills every worker
-                found = Failure(f'{type(error).__name__}: {" ".join(str(error).split())}')
+                found = Failure(f'{type(error).__name__}: {one_line(error)}')
             yield futures[future], found
     finally:
         if client is not None:
@@ -79,10 +79,9 @@ def _connected(connect: Callable[..., Any], address: str) -> Any:
     except ParameterError:
         raise
     except Exception as error:  # of a wrong address, or of what answers there, of any type
-        reason = ' '.join(str(error).split())
         raise ParameterError(f'--scheduler {address}: no answer of a Dask scheduler within '
                              f'{ANSWER:g} s: check host and port, and that dask scheduler runs '
-                             f'({reason:.200})') from None
+                             f'({one_line(error)})') from None
 
 
 async def _try(connect: Callable[..., Any], address: str) -> None:

@@ -14,15 +14,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import GearSettings
-from sa_jitter_ros.offline.average_figures import orders_figure, waveform_figure
-from sa_jitter_ros.offline.envelope_figures import envelope_figure
+from sa_jitter_ros.offline.average_figures import (
+    orders_figure, tracked_orders_figure, waveform_figure)
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.gear_figures import gear_figure
-from sa_jitter_ros.offline.plotting import Array
 from sa_jitter_ros.offline.series import ShaftSeries
-from sa_jitter_ros.offline.spectrum_figures import order_map_figure, spectra, spectrum_figure
-from sa_jitter_ros.offline.trend_figures import tracked_orders_figure
+from sa_jitter_ros.offline.spectrum_figures import (
+    envelope_figure, order_map_figure, spectra, spectrum_figure)
 
 _DPI = 110
 

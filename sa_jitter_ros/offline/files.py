@@ -30,17 +30,21 @@ import tempfile
 from typing import Any, TextIO, TypeVar
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
+from sa_jitter_ros.tacholess.recording import Tacholess
+
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
 TEMPORARY = '.averages.'  # prefix of folders whose files are not finished
 
 _HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycles',
            'fundamental_cycles', 'discarded_cycles')
+_OVER_ANGLE = ('_waveform', '_average', '_standard_error', '_spectrum')  # ends of names
 _COLUMNS = ('recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
             'trigger_cycles', 'discarded_cycles', 'channel')
 _WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles')
@@ -48,11 +52,24 @@ _WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles'
 
 @dataclass(frozen=True)
 class RecordingJob:
-    """One recording to work on: its `name` in the results, its `path`, the folder of its files."""
+    """
+    One recording to work on: its `name` in the results, its `path`, the folder of its files.
+
+    `options` are keywords of `read`. With `tacholess` the pulses are found in the vibration.
+    """
 
     name: str
     path: str
     folder: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    tacholess: Tacholess | None = None
+
+    def settings(self, **others: Any) -> dict[str, Any]:
+        """Return all that decides the files, as values of JSON; raises RecordingError."""
+        found: dict[str, Any] = json_values({
+            'files': stamp(Path(self.path)), 'path': self.path, 'options': self.options,
+            'tacholess': self.tacholess and asdict(self.tacholess), **others})
+        return found
 
 
 @dataclass(frozen=True)
@@ -148,6 +165,32 @@ def read_about(folder: Path) -> dict[str, Any] | None:
     except Exception:  # a broken file may raise an exception of any type: it is written again
         return None
     return found if isinstance(found, dict) else None
+
+
+def read_averages(folder: Path) -> tuple[Signals, list[ShaftSeries], dict[str, Any]]:
+    """
+    Return what a finished folder holds: signals, averages of each shaft, and what it says.
+
+    The arrays over the angle, which are large, are left out. The signals bear the name of the
+    machine, if it has one.
+    """
+    with np.load(folder / ARRAYS) as arrays:
+        about = json.loads(str(arrays['about']))
+        settings = about.get('settings', {})
+        signals = Signals(
+            settings.get('hardware_id') or str(arrays['recording']),
+            tuple(arrays['channels'].tolist()), tuple(arrays['channel_names'].tolist()),
+            tuple(arrays['units'].tolist()), Machine.among(settings.get('machine', {})))
+        return signals, [ShaftSeries(shaft, {
+            name.removeprefix(f'{shaft}_'): arrays[name] for name in arrays.files
+            if name.startswith(f'{shaft}_') and not name.endswith(_OVER_ANGLE)})
+            for shaft in arrays['shafts'].tolist()], about
+
+
+def waveforms(folder: Path, shaft: str) -> Array:
+    """Return the averages of a shaft over the angle, (average, channel, angle)."""
+    with np.load(folder / ARRAYS) as arrays:
+        return np.asarray(arrays[f'{shaft}_waveform'])
 
 
 def _typed(name: str, array: Any) -> Any:

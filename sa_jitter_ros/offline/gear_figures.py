@@ -12,11 +12,12 @@
 
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import gear_lines, GearSettings, separate
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    Array, CORRECTED, heading, MARK, MEASURED, rows_of_channels, strongest_channels)
+    CORRECTED, MARK, MEASURED, rows_of_channels, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 
@@ -72,7 +73,8 @@ def gear_figure(signals: Signals, series: ShaftSeries, gear: GearSettings) -> Fi
         gear_lines(gear, waveform.shape[1])
     except SaJitterError:  # no waveform of so few points has the mesh orders
         return None
-    figure, panels = rows_of_channels(signals, channels, height=2.8, columns=2)
+    figure, panels = rows_of_channels(signals, series, channels, 'last average',
+                                      *['angle of the shaft [degrees]'] * 2, height=2.8)
     figure.set_figwidth(11.0)
     angle = 360.0 * series['angle']
     for row, channel in zip(panels, channels):
@@ -95,9 +97,7 @@ def gear_figure(signals: Signals, series: ShaftSeries, gear: GearSettings) -> Fi
             beside.set_ylabel('phase [degrees]', color='tab:purple')
         for axes in row:
             axes.margins(x=0.0)
-    figure.suptitle(heading(signals, series, 'last average'), fontsize='medium')
     for axes in panels[-1]:
-        axes.set_xlabel('angle of the shaft [degrees]')
         axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.18), fontsize='small',
                     frameon=False, ncols=2 if axes is panels[-1, 1] else 1)
     return figure

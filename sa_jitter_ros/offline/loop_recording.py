@@ -11,18 +11,18 @@
 """One recording: its loop closed, by a function of a job that any process can do."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 import json
 import math
 from pathlib import Path
 from typing import Any
 import warnings
 
-from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, one_line, ParameterError, SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.machine import Machine
-from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, row_values, stamp
+from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, row_values
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.tacholess.recording import Tacholess
@@ -31,13 +31,11 @@ _VERSION = 1  # of the files: those of another one are written again
 _JOB = 'job.json'  # what a finished folder is of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LoopJob(RecordingJob):
-    """One recording whose loop is closed, with the parameter file and the keywords of `read`."""
+    """One recording whose loop is closed, with the path of the parameter file."""
 
     declared: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-    tacholess: Tacholess | None = None
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,8 @@ def loop_file(job: LoopJob) -> LoopRow:
     """
     done = Path(job.folder, _JOB)
     try:
-        settings = json_values({
-            'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
-            'declared': Path(job.declared).read_text(encoding='utf-8'), 'options': job.options,
-            'tacholess': job.tacholess and asdict(job.tacholess)})
+        settings = job.settings(
+            version=_VERSION, declared=Path(job.declared).read_text(encoding='utf-8'))
         found = _finished(done)
         if found.get('settings') == settings:
             return LoopRow(**row_values(found['row']))
@@ -101,7 +97,7 @@ def loop_file(job: LoopJob) -> LoopRow:
     except SaJitterError as error:
         return LoopRow(job.name, job.path, error=str(error))
     loop.write(job.folder)
-    row = _row(job, loop, tuple(' '.join(str(item.message).split()) for item in caught))
+    row = _row(job, loop, tuple(one_line(item.message) for item in caught))
     done.write_text(json.dumps(json_values({'settings': settings, 'row': asdict(row)}), indent=1,
                                allow_nan=False) + '\n', encoding='utf-8')
     return row

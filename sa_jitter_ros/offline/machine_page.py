@@ -16,7 +16,6 @@ It is made of the files of a recording; numbers are those of its last average.
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -24,16 +23,15 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.html_parts import figure, kept, page, table
-from sa_jitter_ros.machine import LEVELS, Machine
+from sa_jitter_ros.machine import LEVELS
 from sa_jitter_ros.monitoring.quantities import best_amplitudes
 from sa_jitter_ros.number_text import HALF_95, measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
-from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
+from sa_jitter_ros.offline.files import read_averages, Signals, write_lines
 from sa_jitter_ros.offline.plotting import squared
 from sa_jitter_ros.offline.series import ShaftSeries
 
 PAGE = 'page.html'
-_OVER_ANGLE = ('waveform', '_average', '_standard_error', '_spectrum')  # ends of names, unused
 _CHANNELS, _ORDERS = 3, 10  # the strongest ones
 _CLEAR = 0.05  # standard error of an attenuation that is one
 _FIGURES = {'waveform': 'Average', 'spectrum': 'Order spectrum', 'tracked_orders': 'Trend',
@@ -46,16 +44,7 @@ def write_page(folder: Path, changes: Changes | None = None, *, place: Path | No
 
     `changes` are those of the machine up to this recording, with their figure beside the page.
     """
-    with np.load(folder / ARRAYS) as arrays:
-        about = json.loads(str(arrays['about']))
-        signals = Signals(
-            about['settings']['hardware_id'] or str(arrays['recording']),
-            tuple(arrays['channels'].tolist()), tuple(arrays['channel_names'].tolist()),
-            tuple(arrays['units'].tolist()), Machine.among(about['settings']['machine']))
-        shafts = [ShaftSeries(shaft, {
-            name.removeprefix(f'{shaft}_'): arrays[name] for name in arrays.files
-            if name.startswith(f'{shaft}_') and not name.endswith(_OVER_ANGLE)})
-            for shaft in arrays['shafts'].tolist()]
+    signals, shafts, about = read_averages(folder)
     place = place or folder / PAGE
     parts = [*_head(signals, shafts, about['row']), *_findings(changes, about), *_limits(signals),
              *_keyphasor(signals, shafts, about['row']),

@@ -16,11 +16,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.series import ShaftSeries
 
-Array = NDArray[Any]
 
 RAW, CORRECTED, MEASURED, MARK = 'tab:red', 'tab:blue', 'black', 'tab:orange'
 MOST_CHANNELS = 3
@@ -55,13 +53,20 @@ def squared(unit: str) -> str:
     return f'{unit or "unit"}²' if unit.isalpha() or not unit else f'({unit})²'
 
 
-def rows_of_channels(signals: Signals, channels: list[int], *, height: float = 2.4,
-                     columns: int = 1) -> tuple[Figure, Any]:
-    """Return a figure with a row of panels for each channel, (channel, column)."""
+def rows_of_channels(signals: Signals, series: ShaftSeries, channels: list[int], text: str,
+                     *labels: str, height: float = 2.4) -> tuple[Figure, Any]:
+    """
+    Return a figure with a row of panels for each channel, (channel, column), and its heading.
+
+    `labels` are those of the axes below the columns.
+    """
     figure = Figure(figsize=(9.0, height * len(channels) + 0.8), layout='constrained')
-    panels = figure.subplots(len(channels), columns, sharex='col', squeeze=False)
+    panels = figure.subplots(len(channels), len(labels), sharex='col', squeeze=False)
+    figure.suptitle(heading(signals, series, text), fontsize='medium')
     for row, channel in zip(panels, channels):
         row[0].set_ylabel(signals.label(channel))
+    for axes, label in zip(panels[-1], labels):
+        axes.set_xlabel(label)
     return figure, panels
 
 

@@ -17,7 +17,7 @@ import os
 import signal
 from typing import Any, TypeVar
 
-from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.errors import one_line, SaJitterError
 
 Job = TypeVar('Job')
 Result = TypeVar('Result')
@@ -40,7 +40,7 @@ def attempt(function: Callable[[Job], Result], job: Job) -> Result | Failure:
     except MemoryError:
         return Failure('not enough memory: use fewer processes (--jobs)')
     except Exception as error:  # what is wrong with one recording costs no other
-        return Failure(f'{type(error).__name__}: {" ".join(str(error).split())}')
+        return Failure(f'{type(error).__name__}: {one_line(error)}')
 
 
 def _work(function: Callable[[Any], Any], job: Any, sender: Any) -> None:

@@ -15,10 +15,9 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.recordings.recording import Recording
 
-FloatArray = NDArray[np.float64]
 Rejected = Sequence[tuple[float, str]]
 
 _PLACES, _AROUND = 5, 6.0  # panels, and pulse intervals on either side of a place

@@ -15,17 +15,15 @@ All averages of a shaft as arrays (average, ...), collected in files so that mem
 `ShaftSeries` holds the arrays under the names that they have in `averages.npz`.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.averaging.results import AverageMessage
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.averaging.results import AverageHeader, AverageMessage
 from sa_jitter_ros.pulses.resampling import periodic
 
-Array = NDArray[Any]
 
 # Names of the arrays where they are not those of the topics, and of the header.
 _NAMES = {'synchronous_average': 'waveform'}
@@ -72,6 +70,22 @@ class ShaftSeries:
     def orders(self) -> Array:
         """Return the orders of all channels."""
         return np.asarray(self.field('order')[0, 0])
+
+    def messages(self, kinds: Collection[str], channels: Sequence[int], orders: Array
+                 ) -> list[dict[str, AverageMessage]]:
+        """Return the results of each average by their topics, of some channels and orders."""
+        headers = [AverageHeader(*row) for row in zip(*(
+            self[_HEADER.get(item.name, item.name)].tolist() for item in fields(AverageHeader)))]
+        found: list[dict[str, AverageMessage]] = [{} for _ in headers]
+        for kind in kinds:
+            if kind in self:
+                names = tuple(self[f'{kind}_{"fields" if kind in _FIELDS else "names"}'].tolist())
+                tables = self[kind][:, channels]
+                if kind == 'order_amplitude':
+                    tables = tables[:, :, np.isin(self.orders, orders)]
+                for parts, header, table in zip(found, headers, tables):
+                    parts[kind] = AverageMessage(header, table, names)
+        return found
 
     @property
     def best_waveform(self) -> Array:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import KeyphasorParameters
 from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.averaging.averager_parameters import (
@@ -32,7 +32,6 @@ from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
 
-FloatArray = NDArray[np.float64]
 
 AVERAGER, DETECTOR = 'synchronous_averager', 'tach_detector'
 _PARAMETERS = {item.name: item for item in PARAMETERS}

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Figures of all orders: the full order spectrum, and the order map over time and speed."""
+"""Figures of all orders: order spectrum, order map over time and speed, squared envelope."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,10 +16,12 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.averaging.envelope import SLIP
 from sa_jitter_ros.averaging.indicators import gear_lines, GearSettings
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    Array, CORRECTED, heading, legend_under, MARK, rows_of_channels, speed_varies,
+    CORRECTED, legend_under, MARK, MEASURED, rows_of_channels, speed_varies, squared,
     strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
@@ -82,13 +84,12 @@ def spectra(series: ShaftSeries) -> Spectra:
 def spectrum_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear: GearSettings
                     ) -> Figure:
     """Draw the full order spectrum, with mesh harmonics, sidebands and tracked orders."""
-    figure, panels = rows_of_channels(signals, found.channels, height=2.7)
+    figure, panels = rows_of_channels(
+        signals, series, found.channels, f'full order spectrum, RMS of {len(series)} averages',
+        'order (multiple of the shaft speed)', height=2.7)
     corrected = 'corrected' if 'corrected_average' in series else 'raw'
     for axes, amplitude, noise in zip(panels[:, 0], found.rms, found.noise):
         _draw_spectrum(axes, signals, series, amplitude, noise, gear, corrected)
-    figure.suptitle(heading(signals, series, (
-        f'full order spectrum, RMS of {len(series)} averages')), fontsize='medium')
-    panels[-1, 0].set_xlabel('order (multiple of the shaft speed)')
     legend_under(panels[-1, 0], columns=5)
     return figure
 
@@ -129,7 +130,9 @@ def order_map_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear
         return None
     highest = _highest(series, found, gear)
     varies = speed_varies(series)
-    figure, panels = rows_of_channels(signals, found.channels, height=2.9, columns=1 + varies)
+    figure, panels = rows_of_channels(
+        signals, series, found.channels, 'order map', 'time [s]',
+        *['speed of the tach shaft [Hz]'] * varies, height=2.9)
     for row, place in zip(panels, range(len(found.channels))):
         decibels = 20.0 * np.log10(np.maximum(found.amplitude[:, place, 1:highest + 1], 1e-300))
         top = float(decibels.max())
@@ -139,10 +142,6 @@ def order_map_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear
         unit = signals.units[found.channels[place]] or 'unit'
         figure.colorbar(image, ax=row[-1], label=f'dB re 1 {unit}')
         row[0].set_ylabel(f'{signals.channel_names[found.channels[place]]}\norder')
-    figure.suptitle(heading(signals, series, 'order map'), fontsize='medium')
-    panels[-1, 0].set_xlabel('time [s]')
-    if varies:
-        panels[-1, 1].set_xlabel('speed of the tach shaft [Hz]')
     return figure
 
 
@@ -185,3 +184,38 @@ def _over_speed(axes: Axes, found: Spectra, decibels: Array, top: float) -> Any:
 def _mesh(axes: Axes, edges: Array, rows: Array, top: float) -> Any:
     return axes.pcolormesh(edges, np.arange(rows.shape[1] + 1) + 0.5, rows.T, vmax=top,
                            vmin=top - _DECIBELS, cmap='viridis', rasterized=True)
+
+
+def envelope_figure(signals: Signals, series: ShaftSeries) -> Figure | None:
+    """Draw the spectrum of the strongest channels, RMS of the averages; None without one."""
+    if 'envelope_spectrum' not in series:
+        return None
+    orders, spectrum = np.moveaxis(series['envelope_spectrum'], -1, 0)
+    found = np.nan_to_num(series['envelope_amplitude'])
+    known = np.isfinite(spectrum).all(axis=(1, 2))
+    if not known.any():
+        return None
+    channels = strongest_channels(series)
+    figure, panels = rows_of_channels(signals, series, channels, (
+        'squared-envelope order spectrum of the residual signal, RMS of '
+        f'{np.count_nonzero(known)} averages'), 'order (multiple of the shaft speed)')
+    rms = np.sqrt(np.mean(spectrum[known] ** 2, axis=0))
+    for axes, channel in zip(panels[:, 0], channels):
+        for number, order in enumerate(found[known][0, channel, :, 0].tolist()):
+            axes.axvspan((1.0 - SLIP) * order, (1.0 + SLIP) * order, color=MARK, alpha=0.3,
+                         linewidth=0.0, label=None if number else 'bearing orders, ± 2 %')
+            name = signals.machine.name_of(series.shaft, order, bearing=True)
+            axes.annotate(name.removeprefix('bearing '), (order, 1.0), rotation=90,
+                          xycoords=('data', 'axes fraction'), textcoords='offset points',
+                          xytext=(2, -3), va='top', fontsize='x-small')
+        axes.plot(orders[0, channel], rms[channel], color=MEASURED, linewidth=0.7,
+                  label='squared envelope')
+        lines = found[known][:, channel]
+        axes.plot(lines[..., 1].mean(axis=0), np.sqrt(np.mean(lines[..., 2] ** 2, axis=0)), 'v',
+                  color='tab:blue', markersize=4.0, label='largest line, RMS')
+        unit = squared(signals.units[channel])
+        axes.set_ylabel(f'{signals.channel_names[channel]}\nsquared envelope [{unit}]')
+        axes.set_ylim(bottom=0.0)
+        axes.margins(x=0.0)
+    legend_under(panels[-1, 0])
+    return figure

@@ -21,17 +21,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import unit_nodes
-from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.prediction.sampled_distribution import require_probabilities
 from scipy.special import ndtr, ndtri
 
-Array = NDArray[Any]
 
 _REACH = 8.5  # standard deviations; 2e-17 of a normal distribution lies outside
 _NODES, _MOST_STEEP = 48, 8  # 1e-9 of a distribution function; times as many where it is steep
@@ -189,16 +187,6 @@ class AmplitudeDistribution:
         return np.asarray(ndtr(_straight(t, self.skew[:, None, None])))
 
 
-def curved_distribution(moments: AverageMoments, unmixed: Array, mixed: Array
-                        ) -> AmplitudeDistribution:
-    """
-    Return the distribution of |X| for an average with third cumulants, in the frame of its phase.
-
-    `unmixed` is k(X, X, X), `mixed` is k(X, X, conj X).
-    """
-    return curved_along(Parts.about(moments.mean, moments, unmixed, mixed))
-
-
 def curved_along(parts: Parts) -> AmplitudeDistribution:
     """Return the distribution of |X| from its parts along and across its mean, the base."""
     across, slope = parts.ii, _ratio(parts.ri, parts.ii)
@@ -294,9 +282,8 @@ def _chord(offset: Array, center: Array, mean: Array, std: Array, skew: Array | 
     return np.where(some, off, 0.0), np.where(some, weight, point)
 
 
-def _quantile_bracket(
-    mean: Array, variance: Array, probability: ArrayLike,
-) -> tuple[Array, Array, Array]:
+def _quantile_bracket(mean: Array, variance: Array, probability: ArrayLike
+                      ) -> tuple[Array, Array, Array]:
     """
     Return probabilities (k,) and bounds (orders, k) of their quantiles, by Cantelli's inequality.
 

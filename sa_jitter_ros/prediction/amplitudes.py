@@ -26,7 +26,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution, curved_along
 from sa_jitter_ros.prediction.angle_error import (
@@ -44,7 +45,6 @@ from sa_jitter_ros.prediction.sampled_distribution import (
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
 from sa_jitter_ros.pulses.angle_law import LINEAR_LAW
 
-Array = NDArray[Any]
 
 # Cycles up to which the distribution is sampled under effects. Of independent pulse errors, as
 # many as leave the curved one 0.005 off in its CDF: more under a bent law, as many again for each
@@ -87,10 +87,8 @@ class Amplitudes:
     draws: Array | None = field(default=None, repr=False)
     noise: Array | None = field(default=None, repr=False)
 
-    def distribution(
-        self, order: ArrayLike, *, shift: ArrayLike = 0.0, noise: ArrayLike = 0.0,
-        most: int | None = None,
-    ) -> AmplitudeDistribution | SampledDistribution:
+    def distribution(self, order: ArrayLike, *, shift: ArrayLike = 0.0, noise: ArrayLike = 0.0,
+                     most: int | None = None) -> AmplitudeDistribution | SampledDistribution:
         """
         Return the distribution of abs(X + shift + n) over all scenarios, one entry per row.
 
@@ -113,10 +111,8 @@ class Amplitudes:
         moments = self.moments.of((rows,)).shifted(shift).with_noise(noise)
         return SampledDistribution(center, values - center[:, None], moments.mean_square)
 
-    def distribution_in(
-        self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
-        noise: ArrayLike = 0.0,
-    ) -> AmplitudeDistribution | SampledDistribution:
+    def distribution_in(self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
+                        noise: ArrayLike = 0.0) -> AmplitudeDistribution | SampledDistribution:
         """Return the same for rows that are in a scenario each; `scenario` (row,) are indices."""
         rows = np.asarray(scenario), np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)

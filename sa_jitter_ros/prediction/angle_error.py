@@ -29,14 +29,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 import math
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.pulses.angle_law import Covariance, LINEAR, PulseWeights
 
-Array = NDArray[Any]
 
 _RANK = 1e-9  # variance of what is left out of drawn processes, over the largest component's
 
@@ -48,10 +48,8 @@ class AngleErrorProcess(Protocol):
     def correlation_length(self) -> int:
         """Largest distance in cycles at which two cycles still depend on each other."""
 
-    def characteristic(
-        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
-        cycles: Sequence[int],
-    ) -> Array:
+    def characteristic(self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+                       cycles: Sequence[int]) -> Array:
         """
         Return E exp(j 2 pi sum_i c_i e_{k_i}(u_i)).
 
@@ -78,10 +76,8 @@ class IndependentPulseJitter:
         """Cycles share pulses as far as the weights of the law reach."""
         return self.weights.pulses - 1
 
-    def characteristic(
-        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
-        cycles: Sequence[int],
-    ) -> Array:
+    def characteristic(self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+                       cycles: Sequence[int]) -> Array:
         """Return the product of the characteristic functions of all pulses that are touched."""
         count = self.weights.pulses
         points = [(self.frequency * np.asarray(c), self.weights.at(np.asarray(u)), k)
@@ -121,10 +117,8 @@ class GaussianAngleError:
         return drawn_normal(rng, self.covariance, min(self.correlation_length, cycles - 1),
                             cycles, u, count)
 
-    def characteristic(
-        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
-        cycles: Sequence[int],
-    ) -> Array:
+    def characteristic(self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+                       cycles: Sequence[int]) -> Array:
         """Return exp(-2 pi^2 variance of the weighted sum)."""
         points = [(np.asarray(c), np.asarray(u), k)
                   for c, u, k in zip(coefficients, positions, cycles)]
@@ -165,10 +159,8 @@ class GaussianPulseJitter(GaussianAngleError):
         return drawn_normal(rng, covariance, pulses - 1, pulses, np.zeros(1), count)[:, 0]
 
 
-def drawn_normal(
-    rng: np.random.Generator, covariance: Covariance, length: int, cycles: int, u: Array,
-    count: int,
-) -> Array:
+def drawn_normal(rng: np.random.Generator, covariance: Covariance, length: int, cycles: int,
+                 u: Array, count: int) -> Array:
     """Return `count` draws (cycle, u, draw) of a stationary normal process, single precision."""
     blocks = np.zeros((cycles, u.size, u.size))
     for lag in range(length + 1):
@@ -194,10 +186,8 @@ def _root(covariance: bytes, cycles: int) -> NDArray[np.float32]:
     return factor
 
 
-def joint_characteristic(
-    processes: Sequence[AngleErrorProcess], coefficients: Sequence[ArrayLike],
-    positions: Sequence[ArrayLike], cycles: Sequence[int],
-) -> Array:
+def joint_characteristic(processes: Sequence[AngleErrorProcess], coefficients: Sequence[ArrayLike],
+                         positions: Sequence[ArrayLike], cycles: Sequence[int]) -> Array:
     """Return the joint characteristic function of the sum of independent processes."""
     product: Array = np.ones(np.broadcast_shapes(*map(np.shape, (*coefficients, *positions))))
     for process in processes:

@@ -31,13 +31,12 @@ block and sliding averages; an exponential one has no notches.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ParameterError
 
-Array = NDArray[Any]
 
 # Closer than this, an order counts as synchronous and a number of cycles as whole.
 _SAME = 1e-9
@@ -128,10 +127,8 @@ def waveform_share(tone_orders: ArrayLike, length: float) -> Array:
                                    for count in (most, fewest))))
 
 
-def leakage(
-    interfering_orders: ArrayLike, orders: ArrayLike, *, cycle_length: float, minimum: int,
-    maximum: int, trigger_cycles: int | None = None,
-) -> Leakage:
+def leakage(interfering_orders: ArrayLike, orders: ArrayLike, *, cycle_length: float, minimum: int,
+            maximum: int, trigger_cycles: int | None = None) -> Leakage:
     """
     Return what an average keeps of interfering orders, and choose its number of trigger cycles.
 

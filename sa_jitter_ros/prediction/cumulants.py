@@ -15,26 +15,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, permutations
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import (
-    AngleErrorProcess,
-    IndependentPulseJitter,
-    joint_characteristic,
-    unit_nodes,
-)
+    AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import Empirical
 from sa_jitter_ros.prediction.moments import (
-    correlation_length,
-    cycle_moments,
-    CycleMoments,
-    require_cycles,
-    require_orders,
-)
+    correlation_length, cycle_moments, CycleMoments, require_cycles, require_orders)
 
-Array = NDArray[Any]
 
 _REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
@@ -47,10 +37,8 @@ _PAIR_NODES = 32
 _INSIDE, _MOST_INSIDE, _FORGOTTEN = 3, 400, 1e-3
 
 
-def third_cumulants(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
-    cycles: CycleMoments, *, nodes: int = _NODES,
-) -> tuple[Array, Array]:
+def third_cumulants(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+                    cycles: CycleMoments, *, nodes: int = _NODES) -> tuple[Array, Array]:
     """
     Return the joint cumulants k(X, X, X) and k(X, X, conj X) of the average, shape (orders,) each.
 
@@ -188,10 +176,8 @@ def _pairs(g: Array, processes: Sequence[AngleErrorProcess], mean: Array, u: Arr
     return found[0], found[1]
 
 
-def average_cumulants(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
-    cycles: CycleMoments,
-) -> tuple[Array, Array]:
+def average_cumulants(orders: ArrayLike, processes: Sequence[AngleErrorProcess],
+                      trigger_cycles: int, cycles: CycleMoments) -> tuple[Array, Array]:
     """
     Return k(X, X, X) and k(X, X, conj X): integrated where the memory is short, else superposed.
 
@@ -226,10 +212,8 @@ def average_cumulants(
             every[1] - spurious[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
 
 
-def _integrated(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
-    cycles: CycleMoments,
-) -> tuple[Array, Array]:
+def _integrated(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+                cycles: CycleMoments) -> tuple[Array, Array]:
     """Return `third_cumulants` with as many nodes as the spread of a table asks for."""
     g = np.asarray(orders, float)
     tables = [process for process in processes if isinstance(process, IndependentPulseJitter)

@@ -20,10 +20,10 @@ average (`comb`), and all of them how small a change one average shows (`detecti
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, unwrapped
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
@@ -34,7 +34,6 @@ from sa_jitter_ros.prediction.moments import cycle_moments, require_orders
 from sa_jitter_ros.prediction.prediction import predict
 from scipy.optimize import brentq
 
-Array = NDArray[Any]
 
 #: Distributions of pulse errors that are as wide as the keyphasor rate makes them.
 RATE_DISTRIBUTIONS = ('uniform', 'normal', 'triangular')
@@ -99,15 +98,13 @@ class DesignGrid:
     variation: Array
 
 
-def design(
-    *, orders: Sequence[float], trigger_speed: float, maximum_loss: float = 0.05,
-    maximum_variation: float = 0.05, keyphasor_rate: float | None = None,
-    trigger_cycles: int | None = None, ratio: float = 1.0, pulses_per_revolution: int = 1,
-    pulses_per_trigger: int | None = None, jitter_distribution: str = 'uniform',
-    noise_std: float = 0.0, sample_rate: float = 0.0, others: Sequence[float] = (),
-    tones: Sequence[float] = (), change: float | None = None,
-    false_alarm_rate: float | None = None,
-) -> Design:
+def design(*, orders: Sequence[float], trigger_speed: float, maximum_loss: float = 0.05,
+           maximum_variation: float = 0.05, keyphasor_rate: float | None = None,
+           trigger_cycles: int | None = None, ratio: float = 1.0, pulses_per_revolution: int = 1,
+           pulses_per_trigger: int | None = None, jitter_distribution: str = 'uniform',
+           noise_std: float = 0.0, sample_rate: float = 0.0, others: Sequence[float] = (),
+           tones: Sequence[float] = (), change: float | None = None,
+           false_alarm_rate: float | None = None) -> Design:
     """
     Choose the keyphasor rate and the number of trigger cycles, or assess those that are given.
 
@@ -232,9 +229,8 @@ def required_trigger_cycles(model: DeclaredModel, maximum_variation: float) -> i
     return high
 
 
-def design_grid(
-    model: DeclaredModel, keyphasor_rates: ArrayLike, trigger_cycles: ArrayLike,
-) -> DesignGrid:
+def design_grid(model: DeclaredModel, keyphasor_rates: ArrayLike, trigger_cycles: ArrayLike
+                ) -> DesignGrid:
     """Return the figures of the highest (worst) order over rates (Hz) and trigger cycles."""
     worst = replace(model, orders=(max(model.orders),))
     rates = np.asarray(keyphasor_rates, float)
@@ -248,9 +244,8 @@ def design_grid(
     return DesignGrid(rates, cycles, *figures)
 
 
-def detection_probability(
-    model: DeclaredModel, changes: ArrayLike, false_alarm_rate: float,
-) -> Array:
+def detection_probability(model: DeclaredModel, changes: ArrayLike, false_alarm_rate: float
+                          ) -> Array:
     """
     Return the probability, shape (orders, k), that one average shows each of k relative changes.
 
@@ -282,9 +277,8 @@ def detection_probability(
     return np.hstack(detected)
 
 
-def _interfering_orders(
-    model: DeclaredModel, others: Sequence[float], tones: Sequence[float],
-) -> Array:
+def _interfering_orders(model: DeclaredModel, others: Sequence[float], tones: Sequence[float]
+                        ) -> Array:
     """Return the orders of everything that interferes; raise ParameterError for what cannot."""
     for name, given, unit in (('others', others, ''), ('tones', tones, ' Hz')):
         for value in numbers(name, given):

@@ -20,14 +20,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 from numbers import Real
-from typing import Any, Protocol, runtime_checkable, TypeVar
+from typing import Protocol, runtime_checkable, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from scipy.special import ndtri
 
-Array = NDArray[Any]
 Shape = int | tuple[int, ...]
 
 _TAYLOR_TERMS = 8

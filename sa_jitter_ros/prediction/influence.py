@@ -20,17 +20,17 @@ have parameters and can be found in measured data.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 
-Array = NDArray[Any]
 
 _SMOOTH = 25  # pulses over which a speed is taken
 

@@ -18,13 +18,7 @@ import numpy as np
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.prediction.distributions import (
-    Empirical,
-    is_number,
-    Normal,
-    PulseErrorDistribution,
-    Triangular,
-    Uniform,
-)
+    Empirical, is_number, Normal, PulseErrorDistribution, Triangular, Uniform)
 from sa_jitter_ros.prediction.moments import require_cycles, require_orders
 from sa_jitter_ros.pulses.angle_law import angle_law, ANGLE_LAWS, PulseWeights
 

@@ -21,22 +21,18 @@ pulse, so lag 1 belongs in every variance.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import (
-    angle_spread,
-    AngleErrorProcess,
-    joint_characteristic,
-    unit_nodes,
-)
+    angle_spread, AngleErrorProcess, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import is_number
 
-Array = NDArray[Any]
 
 NODES = 64
 _NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly
@@ -80,18 +76,11 @@ class AverageMoments:
 
     def shifted(self, shift: ArrayLike) -> 'AverageMoments':
         """Return the moments of X + shift."""
-        return AverageMoments(self.mean + np.asarray(shift), self.variance, self.pseudo_variance)
-
-    def scaled(self, gain: ArrayLike) -> 'AverageMoments':
-        """Return the moments of gain * X."""
-        g = np.asarray(gain)
-        return AverageMoments(self.mean * g, self.variance * np.abs(g) ** 2,
-                              self.pseudo_variance * g**2)
+        return replace(self, mean=self.mean + np.asarray(shift))
 
     def with_noise(self, variance: ArrayLike) -> 'AverageMoments':
         """Return the moments of X + n with circular noise of variance E|n|^2."""
-        return AverageMoments(self.mean, self.variance + np.asarray(variance),
-                              self.pseudo_variance)
+        return replace(self, variance=self.variance + np.asarray(variance))
 
 
 @dataclass(frozen=True)
@@ -121,10 +110,8 @@ class CycleMoments:
                               weight @ self.pseudo_variance[lags])
 
 
-def cycle_moments(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, nodes: int = NODES,
-    lags: int | None = None,
-) -> CycleMoments:
+def cycle_moments(orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, nodes: int = NODES,
+                  lags: int | None = None) -> CycleMoments:
     """
     Return the exact moments of single trigger cycles for orders of shape (n,).
 

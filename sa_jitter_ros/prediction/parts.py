@@ -16,14 +16,13 @@ difference of the complex moments, of which the two parts consist, leave nothing
 in 16 digits. Here each part has a number of its own, and the means are those of what is missing.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.moments import AverageMoments
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -90,24 +89,20 @@ class Parts:
 
     def shrunk(self, factor: Array) -> 'Parts':
         """Return the parts under small errors that are all `factor` times as large."""
-        k = [factor**n for n in range(7)]
-        return Parts(self.base, self.r * k[2], self.i * k[1], self.rr * k[4], self.ri * k[3],
-                     self.ii * k[2], self.rrr * k[6], self.rri * k[5], self.rii * k[4],
-                     self.iii * k[3])
+        return Parts(self.base, *(
+            getattr(self, name) * factor ** (2 * name.count('r') + name.count('i'))
+            for name in _CUMULANTS))
 
     def scaled(self, gain: ArrayLike) -> 'Parts':
         """Return the parts of gain * X."""
         size = np.abs(np.asarray(gain))
-        one, two, three = size, size**2, size**3
-        return Parts(self.base * gain, self.r * one, self.i * one, self.rr * two, self.ri * two,
-                     self.ii * two, self.rrr * three, self.rri * three, self.rii * three,
-                     self.iii * three)
+        return Parts(self.base * gain, *(
+            getattr(self, name) * size ** len(name) for name in _CUMULANTS))
 
     def with_noise(self, variance: ArrayLike) -> 'Parts':
         """Return the parts of X + n with circular noise of variance E|n|^2."""
         half = 0.5 * np.asarray(variance)
-        return Parts(self.base, self.r, self.i, self.rr + half, self.ri, self.ii + half, self.rrr,
-                     self.rri, self.rii, self.iii)
+        return replace(self, rr=self.rr + half, ii=self.ii + half)
 
     def shifted(self, shift: ArrayLike) -> 'Parts':
         """Return the parts of X + shift, along and across the new base."""
@@ -118,8 +113,7 @@ class Parts:
         off = self.r + 1j * self.i
         found = self._along(self.base + off * self.direction)
         zero = np.zeros(np.shape(self.r))
-        return Parts(found.base, zero, zero, *(getattr(found, item.name)
-                                               for item in fields(self)[3:]))
+        return replace(found, r=zero, i=zero)
 
     def _along(self, base: Array) -> 'Parts':
         """Return the parts in the direction of another base; the means stay those of X - base."""
@@ -139,6 +133,9 @@ class Parts:
             + (c**3 - 2.0 * c * s**2) * self.rii - c**2 * s * self.iii,
             s**3 * self.rrr + 3.0 * c * s**2 * self.rri + 3.0 * c**2 * s * self.rii
             + c**3 * self.iii)
+
+
+_CUMULANTS = [item.name for item in fields(Parts) if item.name != 'base']
 
 
 def offset_of(center: Array, mean_along: Array, mean_across: Array, along: Array, across: Array

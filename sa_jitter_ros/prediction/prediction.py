@@ -18,10 +18,10 @@ and quantiles of the amplitude of a unit component for every order.
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.amplitudes import line_variance, unit_amplitudes
@@ -30,7 +30,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
 
-Array = NDArray[Any]
 
 QUANTILES = (0.05, 0.50, 0.95)
 

@@ -22,7 +22,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, unit_nodes
 from sa_jitter_ros.prediction.distributions import Empirical
@@ -30,7 +31,6 @@ from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.pulses.angle_law import LINEAR, PulseWeights
 
-Array = NDArray[Any]
 #: ``known(count)``: pulse errors (count, pulse) in fundamental cycles of as many averages.
 KnownErrors = Callable[[int], Array]
 
@@ -148,9 +148,8 @@ class SampledDistribution:
             values, np.clip(index, 0, count - 1), axis=1))
 
 
-def can_be_sampled(
-    processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int,
-) -> bool:
+def can_be_sampled(processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int
+                   ) -> bool:
     """Return whether averages of all processes can be drawn, and in about a second."""
     pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
     points = trigger_cycles * (1 if pulsed else _PLACES)
@@ -161,11 +160,9 @@ def can_be_sampled(
         for process in processes)
 
 
-def drawn_averages(
-    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
-    weights: PulseWeights = LINEAR, known: KnownErrors | None = None, each: Array | None = None,
-    spread: float = 0.0,
-) -> tuple[Array, Array]:
+def drawn_averages(orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
+                   weights: PulseWeights = LINEAR, known: KnownErrors | None = None,
+                   each: Array | None = None, spread: float = 0.0) -> tuple[Array, Array]:
     """
     Return X - 1 (order, draw) of averages of `trigger_cycles` cycles, and noise, E|n|^2 1.
 

@@ -11,16 +11,14 @@
 """Exact moments of averages whose pulse errors are known but for random ones on top."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
 
-Array = NDArray[Any]
 
 _COARSE, _FINE = unit_nodes(16), unit_nodes(32)
 _CLEAR = 0.05  # mean phasor down to which the coarse rule is exact to 1e-6
@@ -28,9 +26,8 @@ _STEEP = 0.5  # fundamental cycles within a cycle: there a pulse is missing
 _BLOCK = 1_000_000  # phasors held at once
 
 
-def scenario_moments(
-    model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
-) -> AverageMoments:
+def scenario_moments(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array
+                     ) -> AverageMoments:
     """
     Return the moments (scenario, order) of averages with known pulse `errors` (scenario, n).
 

@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.libraries import library
 from sa_jitter_ros.recordings.limits import check_bag
 from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, FLOAT32, FLOAT64, IMU, SampleDecoder,
     TIME_REFERENCE, TIME_TOLERANCE)
 from sa_jitter_ros.recordings.recording import (
-    FloatArray, MAX_PULSES, rechunk, Recording, recording_errors)
+    library, MAX_PULSES, rechunk, Recording, recording_errors)
 from sa_jitter_ros.samples import SampleBlock
 
 _SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)

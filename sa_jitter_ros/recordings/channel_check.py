@@ -13,13 +13,12 @@
 from collections.abc import Collection, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import with_channels
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from sa_jitter_ros.recordings.recording import Recording
 
-FloatArray = NDArray[np.float64]
 
 _MOST_LOST = 0.5  # of the samples
 _AT_END = 0.02  # of the samples, at the very same largest or smallest value
@@ -66,7 +65,7 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
     return found
 
 
-def stuck(values: FloatArray) -> NDArray[np.bool_]:
+def stuck(values: FloatArray) -> BoolArray:
     """
     Return which samples (sample,) of a channel repeat one value, as a loose contact makes them.
 

@@ -11,7 +11,7 @@
 """
 Recordings in files that hold a list of channels, each with its own name, unit, rate and start.
 
-Formats of measuring systems are such lists (`tdms_format`, `mdf_format`, `uff_format`).
+Formats of measuring systems are such lists (`list_formats`).
 """
 
 from collections import Counter
@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.channel_map import ChannelMap, find_channel
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 Opened = Callable[[], AbstractContextManager[Any]]
 
@@ -105,23 +106,18 @@ def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: Channe
         raise RecordingError('; '.join(['no channel with samples at a constant rate',
                                         *left_out[:_MOST_NAMED]]))
     try:
-        tach = find_channel(names, channel_map.tach) if channel_map.tach else None
-        chosen = [find_channel(names, entry) for entry in channel_map.vibration]
+        chosen, tach = channel_map.roles(names)
     except RecordingError as error:
         raise RecordingError('; '.join([str(error), *left_out[:_MOST_NAMED]])) from None
     remarks = list(left_out)
-    others = [k for k in range(len(channels)) if k != tach]
-    if not chosen and others:
-        together = Counter(_clock(channels[k]) for k in others)
+    if not channel_map.vibration:
+        together = Counter(_clock(channels[k]) for k in chosen)
         most = max(together, key=lambda clock: together[clock] * clock[2])
-        chosen = [k for k in others if _clock(channels[k]) == most]
-        if len(together) > 1:
-            remarks.append(
-                'left out, because they were not sampled with '
-                f'{names[chosen[0]]}: ' + _listed([names[k] for k in others if k not in chosen]))
-    if not chosen:
-        raise RecordingError(f'the only channel, {channel_map.tach}, is the tach: name a channel '
-                             'of vibration')
+        others = [names[k] for k in chosen if _clock(channels[k]) != most]
+        chosen = tuple(k for k in chosen if _clock(channels[k]) == most)
+        if others:
+            remarks.append('left out, because they were not sampled with '
+                           f'{names[chosen[0]]}: {_listed(others)}')
     if len({_clock(channels[k]) for k in chosen}) > 1:
         raise RecordingError('channels of different rates, starts or lengths: ' + _listed([
             f'{names[k]} {channels[k].samples} samples at {channels[k].rate or 0.0:g} Hz'

@@ -21,20 +21,19 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import fixed, Parameter
 from sa_jitter_ros.recordings.recording import ChangedSource, Recording
 
-FloatArray = NDArray[np.float64]
 #: Channels by name, each with `unit` and `sensitivity`, in the order of the machine file.
 Channels = Mapping[str, Mapping[str, Any]]
 
 PREFIX = 'machine.channels.'
 _FIELDS = {item.name: item for item in (
-    Parameter('unit', '', 'unit of this vibration channel', read_only=True),
-    Parameter('sensitivity', math.nan, 'of its sensor with amplifier, by which the vibration is '
-              'divided; NaN: it comes in the unit', unit='V per unit', read_only=True))}
+    fixed('unit', '', 'unit of this vibration channel'),
+    fixed('sensitivity', math.nan, 'of its sensor with amplifier, by which the vibration is '
+          'divided; NaN: it comes in the unit', unit='V per unit'))}
 _VOLTS = {'': 1.0, '1': 1.0, 'v': 1.0, 'mv': 1e-3, 'uv': 1e-6, 'µv': 1e-6}
 
 

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import TextIO
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.csv_layout import CsvLayout, layout_of, MAX_LINE
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 
 @dataclass(frozen=True)

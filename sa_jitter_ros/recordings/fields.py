@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError, RecordingError, SignalError
 from sa_jitter_ros.pulses.sampled_angle import counter_pulses
-from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
+from sa_jitter_ros.recordings.recording import ArraySource, MAX_PULSES, Recording
 
 _MAX_SAMPLE_BYTES = 1 << 40
 _MAX_PULSE_BYTES = 8 * MAX_PULSES
@@ -31,6 +32,8 @@ MAX_FIELD_BYTES = 1 << 20
 RawArray = NDArray[Any]
 #: Returns the array under a key of a file, of at most so many bytes.
 Load = Callable[[str, int], RawArray]
+#: The names of the arrays of a file, and what loads one.
+Arrays = tuple[Collection[str], Load]
 SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
 _PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
 _TEXT_FIELDS = ('channel_names', 'units', 'description')
@@ -111,8 +114,7 @@ def shown_keys(keys: Collection[str]) -> str:
     return ', '.join(some) + (', ...' if len(keys) > len(some) else '') if some else 'none'
 
 
-def recording_from_fields(names: Collection[str], load: Load, *,
-                          acquisition: int, given: Mapping[str, Any],
+def recording_from_fields(arrays: Arrays, *, acquisition: int, given: Mapping[str, Any],
                           pulses_suffice: bool = False) -> Recording:
     """
     Build a recording from named arrays.
@@ -123,10 +125,9 @@ def recording_from_fields(names: Collection[str], load: Load, *,
 
     Parameters
     ----------
-    names
-        The fields of the file; unknown ones are ignored.
-    load
-        Returns the array under a name, of at most so many bytes.
+    arrays
+        The names of the fields of the file, of which unknown ones are ignored, and what returns
+        the array under a name, of at most so many bytes.
     acquisition
         Number of the acquisition, from 0.
     given
@@ -142,13 +143,14 @@ def recording_from_fields(names: Collection[str], load: Load, *,
     Examples
     --------
     >>> arrays = {'vibration': np.zeros((2, 1000)), 'tach_count': np.arange(1000) // 40}
-    >>> recording = recording_from_fields(arrays, lambda name, limit: arrays[name],
-    ...                                   acquisition=0, given={
-    ...                                       'sample_rate': 1e3, 'tach_rate': 1e3})
+    >>> recording = recording_from_fields(
+    ...     (arrays, lambda name, limit: arrays[name]), acquisition=0,
+    ...     given={'sample_rate': 1e3, 'tach_rate': 1e3})
     >>> recording.channels, recording.pulse_times[:3]
     (2, array([0.04, 0.08, 0.12]))
 
     """
+    names, load = arrays
     values, sources = given_fields(given, names)
     taken = {key for several in sources.values() for key in several}
     keys = {**{name: (name,) for name in FIELDS

@@ -16,7 +16,8 @@ a text is a dataset of character codes, a cell one of references. Large datasets
 chunk into an unnamed temporary file and mapped there, as members of an `.npz` are.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import islice
 from math import prod
 from pathlib import Path
@@ -25,20 +26,19 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import MAX_FIELD_BYTES, RawArray, recording_from_fields
-from sa_jitter_ros.recordings.libraries import library
+from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES, RawArray
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording
+from sa_jitter_ros.recordings.recording import library
 
 _ROWS_BYTES = 1 << 24
 _MOST_CELLS = 10_000
 _MOST_KEYS = 100_000
 
 
-def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
-              pulses_suffice: bool = False) -> Recording:
+@contextmanager
+def hdf5_arrays(path: Path) -> Iterator[Arrays]:
     """
-    Open a `.mat` recording of version 7.3; fields as in `recording_from_fields`.
+    Open a `.mat` recording of version 7.3: yield the keys of its variables, and what loads one.
 
     A variable inside a struct has the key `struct/variable`, in element k of an array of structs
     `struct/k/variable`. Raises RecordingError if h5py is not
@@ -49,9 +49,7 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
         import h5py
     with h5py.File(path, 'r') as file:
         variables = dict(islice(_datasets(file, file, '', ()), _MOST_KEYS))
-        return recording_from_fields(
-            variables, lambda name, limit: _array(file, name, variables[name], limit),
-            acquisition=acquisition, given=given, pulses_suffice=pulses_suffice)
+        yield variables, lambda name, limit: _array(file, name, variables[name], limit)
 
 
 def _datasets(file: Any, group: Any, prefix: str, above: tuple[Any, ...]

@@ -26,10 +26,9 @@ import struct
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError, SaJitterError
 
-FloatArray = NDArray[np.float64]
 
 MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
 MAX_VALUES = 200_000_000  # samples of all channels that are read into memory

@@ -25,7 +25,8 @@ have to walk all tags, also those of compressed variables, and this walk is most
 Second, loadmat reads whole variables into memory, with no limit of their unpacked size.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from math import prod
@@ -33,16 +34,13 @@ import mmap
 from pathlib import Path
 import struct
 import tempfile
-from typing import Any
 import zlib
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import (
-    MAX_FIELD_BYTES, RawArray, recording_from_fields)
-from sa_jitter_ros.recordings.hdf5_format import open_hdf5
+from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES, RawArray
+from sa_jitter_ros.recordings.hdf5_format import hdf5_arrays
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording
 
 _Buffer = bytes | mmap.mmap
 
@@ -78,10 +76,10 @@ class _Matrix:
     stop: int
 
 
-def open_mat(path: Path, *, acquisition: int, given: Mapping[str, Any],
-             pulses_suffice: bool = False) -> Recording:
+@contextmanager
+def mat_arrays(path: Path) -> Iterator[Arrays]:
     """
-    Open a `.mat` recording; fields as in `recording_from_fields`.
+    Open a `.mat` recording: yield the keys of its variables, and what loads one.
 
     Raises RecordingError if the file is broken, of version 4, of version 7.3 without h5py, or a
     variable of a recording has the wrong class.
@@ -89,14 +87,13 @@ def open_mat(path: Path, *, acquisition: int, given: Mapping[str, Any],
     with open(path, 'rb') as file:
         head = file.read(_HEADER)
         if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
-            return open_hdf5(path, acquisition=acquisition, given=given,
-                             pulses_suffice=pulses_suffice)
+            with hdf5_arrays(path) as arrays:
+                yield arrays
+            return
         order = _byte_order(head)
         whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     variables = dict(_Reader(order).variables(whole))
-    return recording_from_fields(variables, lambda name, limit: variables[name](limit),
-                                 acquisition=acquisition, given=given,
-                                 pulses_suffice=pulses_suffice)
+    yield variables, lambda name, limit: variables[name](limit)
 
 
 def _byte_order(head: bytes) -> str:

@@ -21,12 +21,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.samples import SampleBlock
 
-FloatArray = NDArray[np.float64]
 
 FLOAT64 = 'std_msgs/Float64MultiArray'
 FLOAT32 = 'std_msgs/Float32MultiArray'

@@ -16,7 +16,8 @@ once into an unnamed temporary file (in `$TMPDIR`) and mapped there. numpy.load 
 ignores `mmap_mode` for archives, and reads a member without a limit of its unpacked size.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from math import prod
 import os
@@ -30,7 +31,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import CONVERTED, RawArray, recording_from_fields
+from sa_jitter_ros.recordings.fields import Arrays, CONVERTED, RawArray
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -38,19 +39,17 @@ _COPY_BYTES = 1 << 20
 _HEADER_BYTES = 10_000
 
 
-def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any],
-             pulses_suffice: bool = False) -> Recording:
+@contextmanager
+def npz_arrays(path: Path) -> Iterator[Arrays]:
     """
-    Open an `.npz` recording; fields as in `recording_from_fields`.
+    Open an `.npz` recording: yield the names of its arrays, and what loads one.
 
     Raises RecordingError if the archive is broken, contains pickled objects or a field exceeds its
     limit.
     """
     with _archive(path) as archive:
-        names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
-        return recording_from_fields(
-            names, lambda name, limit: _member(archive, path, name, limit),
-            acquisition=acquisition, given=given, pulses_suffice=pulses_suffice)
+        yield ([name[:-4] for name in archive.namelist() if name.endswith('.npy')],
+               lambda name, limit: _member(archive, path, name, limit))
 
 
 def _archive(path: Path) -> zipfile.ZipFile:

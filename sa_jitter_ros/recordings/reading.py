@@ -18,21 +18,31 @@ from types import MappingProxyType
 from typing import Any
 
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.parameters import fixed
 from sa_jitter_ros.recordings.bag_format import open_bag
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.channel_units import Channels, channels_of, in_units, PREFIX
 from sa_jitter_ros.recordings.csv_format import open_csv
-from sa_jitter_ros.recordings.fields import given_fields, require_fields, SAMPLE_FIELDS
-from sa_jitter_ros.recordings.mat_format import open_mat
-from sa_jitter_ros.recordings.mdf_format import open_mdf
-from sa_jitter_ros.recordings.npz_format import open_npz
+from sa_jitter_ros.recordings.fields import (
+    given_fields, recording_from_fields, require_fields, SAMPLE_FIELDS)
+from sa_jitter_ros.recordings.list_formats import open_mdf, open_tdms, open_uff
+from sa_jitter_ros.recordings.mat_format import mat_arrays
+from sa_jitter_ros.recordings.npz_format import npz_arrays
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
-from sa_jitter_ros.recordings.tdms_format import open_tdms
-from sa_jitter_ros.recordings.uff_format import open_uff
 from sa_jitter_ros.recordings.wav_format import open_wav
 
 _LISTS = {'.csv': open_csv, '.tdms': open_tdms, '.mf4': open_mdf, '.mdf': open_mdf,
           '.uff': open_uff, '.unv': open_uff}  # what opens files that are lists of channels
+#: Keywords of `read` that commands and the recording player take, too.
+READ_PARAMETERS = (
+    fixed('acquisition', 0, 'acquisition to read, from 0, of several in a file', minimum=0),
+    fixed('sample_rate', 0.0, 'sampling rate of the vibration, if not in the file', unit='Hz',
+          minimum=0.0),
+    fixed('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of a '
+          'bag; empty: all but the tach', element=str),
+    fixed('tach_channel', '', 'name or number of the tach waveform'),
+    fixed('time_column', '', 'name or number of the column of times in a .csv'),
+)
 SUFFIXES = ('.npz', '.mat', '.wav', *_LISTS, '.mcap', '.db3')
 
 
@@ -116,9 +126,9 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
             raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '
                                  f'{", ".join(SUFFIXES)} or a rosbag2 folder; convert it')
         if suffix in ('.npz', '.mat'):
-            opened = open_npz if suffix == '.npz' else open_mat
-            recording = channel_map.select(opened(
-                path, acquisition=acquisition, given=fields, pulses_suffice=pulses_suffice))
+            with (npz_arrays if suffix == '.npz' else mat_arrays)(path) as arrays:
+                recording = channel_map.select(recording_from_fields(
+                    arrays, acquisition=acquisition, given=fields, pulses_suffice=pulses_suffice))
         else:
             channel_map, given = _in_channels(channel_map, fields)
             if suffix == '.wav':

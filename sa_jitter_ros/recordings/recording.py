@@ -15,17 +15,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.arrays import Array, FloatArray
+from sa_jitter_ros.errors import one_line, RecordingError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.samples import SampleBlock, unresolved_times
 
-FloatArray = NDArray[np.float64]
 
 _MAX_CHANNELS = 4096
 MAX_PULSES = 50_000_000
@@ -50,7 +49,7 @@ class SampleSource(Protocol):
 class ArraySource:
     """Samples of an array or a memory map (`channel` x `sample`, any real dtype)."""
 
-    array: NDArray[Any]
+    array: Array
 
     @property
     def channels(self) -> int:
@@ -319,17 +318,31 @@ def recording_errors(path: str | Path) -> Iterator[None]:
     except RecordingError as error:
         if str(error).startswith(place):
             raise
-        raise RecordingError(f'{place}{_line(error)}') from error
+        raise RecordingError(f'{place}{one_line(error)}') from error
     except Exception as error:
-        reason = _line(error) or 'no reason given'
+        reason = one_line(error) or 'no reason given'
         raise RecordingError(
             f'{place}cannot be read ({type(error).__name__}: {reason})') from error
 
 
-def _line(error: Exception) -> str:
-    """Return the message of an error, which may quote the file, as one line of limited length."""
-    text = ' '.join(str(error).split())
-    return text if len(text) <= 500 else f'{text[:500]} ...'
+@contextmanager
+def library(reads: str, name: str, extra: str, otherwise: str = '') -> Iterator[None]:
+    """
+    Raise RecordingError that says how to install a library if an import within it fails.
+
+    `reads` is what it reads, `extra` the one of this package that installs it.
+
+    >>> with library('bags are', 'rosbags', 'bags'):  # doctest: +ELLIPSIS
+    ...     import no_such
+    Traceback (most recent call last):
+    ...
+    sa_jitter_ros.errors.RecordingError: bags are read with rosbags, which is not installed: ...
+    """
+    try:
+        yield
+    except ImportError:
+        raise RecordingError(f'{reads} read with {name}, which is not installed: pip install '
+                             f"'sa_jitter_ros[{extra}]' or {name}{otherwise}") from None
 
 
 def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[FloatArray]:

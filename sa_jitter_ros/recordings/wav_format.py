@@ -22,8 +22,9 @@ from pathlib import Path
 import struct
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
 _WIDTHS = {_PCM: (8, 16, 24, 32), _FLOAT: (32, 64)}

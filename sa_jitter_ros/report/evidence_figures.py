@@ -12,21 +12,19 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import LINEAR
 from sa_jitter_ros.report.expected_errors import (
     cycle_places, lags_of, Version, versions_of, with_explained_errors)
-from sa_jitter_ros.report.plotting import add_legend, AFTER, BEFORE, MEASURED, panels
+from sa_jitter_ros.report.plotting import AFTER, BEFORE, MEASURED, panels
 
-Array = NDArray[Any]
 Words = Callable[[float], str]  # an order in a sentence
 
 _MICRO = 1e6
@@ -76,15 +74,12 @@ def amplitudes(evidence: Evidence, channel_names: Sequence[str], words: Words) -
         axes[0].plot(change, linewidth=0.6, alpha=0.8, label=name)
     axes[0].set(title='cycle by cycle', xlabel='trigger cycle of the fitted acquisitions',
                 ylabel='relative change of the amplitude')
-    add_legend(axes[0])
     for other in range(1, len(names)):
         axes[1].plot(_thinned(changes[..., 0]), _thinned(changes[..., other]), '.', markersize=2,
                      color=f'C{other}', label=names[other])
     axes[1].locator_params(axis='x', nbins=6)  # of many digits
     axes[1].set(title='correlation between lines', xlabel=f'relative change, {names[0]}',
                 ylabel='relative change, other lines')
-    if len(names) > 1:
-        add_legend(axes[1])
     power = np.mean(np.abs(np.fft.rfft(changes, axis=1)[:, 1:]) ** 2, axis=0) * 2.0 / cycles
     axes[2].semilogy(np.fft.rfftfreq(cycles)[1:], power, linewidth=0.9)
     axes[2].set(title='spectrum', xlabel='frequency / trigger rate',
@@ -107,7 +102,6 @@ def _over_time(axes: Axes, evidence: Evidence, version: Version) -> None:
                   label='deterministic part, first acquisition')
     axes.set(title='over an acquisition', xlabel='time since its start [s]',
              ylabel='pulse error [µs]')
-    add_legend(axes)
 
 
 def _distribution(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
@@ -122,7 +116,6 @@ def _distribution(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -
         axes.hist(_MICRO * item.draws, edges, density=True, histtype='step', color=item.colour,
                   label=item.label)
     axes.set(title='distribution', xlabel='pulse error [µs]', ylabel='density [1/µs]')
-    add_legend(axes)
 
 
 def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
@@ -139,7 +132,6 @@ def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]
         axes.errorbar(lags[1:], rows.mean(axis=0)[1:] / scale, yerr=error[1:], fmt='o',
                       markersize=3, capsize=2, color=MEASURED, label='recovered')
     axes.set(title='autocorrelation', xlabel='lag [trigger pulses]', ylabel='correlation')
-    add_legend(axes)
 
 
 def _return_map(axes: Axes, evidence: Evidence) -> None:
@@ -161,7 +153,6 @@ def _lattice(axes: Axes, evidence: Evidence) -> None:
         axes.plot(*2 * [[grid.min(), grid.max()]], color=AFTER, linewidth=0.9, label='slope 1')
         axes.set(title=f'clock of the pulse times, {evidence.clock.rate:.6g} Hz',
                  xlabel='error due to its ticks [µs]', ylabel='recovered pulse error [µs]')
-        add_legend(axes)
         return
     rate = evidence.model.keyphasor_rate
     ticks = ((evidence.times - evidence.errors) * rate) % 1.0
@@ -183,7 +174,6 @@ def _origin(axes: Axes, evidence: Evidence) -> None:
     axes.set(title='origin of the errors',
              xlabel='second difference of the pulse errors [µs]',
              ylabel='second difference of\nthe pulse times [µs]')
-    add_legend(axes)
 
 
 def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
@@ -195,7 +185,6 @@ def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> 
         axes.axhline(_MICRO * item.std, color=item.colour, linewidth=0.9, label=item.label)
     axes.set(title='over the record', xlabel='time [s]', ylabel='RMS pulse error [µs]')
     axes.set_ylim(bottom=0.0)
-    add_legend(axes)
 
 
 def _intervals(axes: Axes, evidence: Evidence) -> None:
@@ -222,7 +211,6 @@ def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> Non
     axes.set(title='over the trigger cycle', xlabel='position in the trigger cycle, u',
              ylabel='RMS angle error [µs]')
     axes.set_ylim(bottom=0.0)
-    add_legend(axes)
 
 
 def _angle_errors(evidence: Evidence, u: Array) -> Array:
@@ -266,7 +254,6 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
     axes.set_xticks([], minor=True)
     axes.set(title=words(g), xlabel='trigger cycles in an average',
              ylabel='attenuation')
-    add_legend(axes)
 
 
 def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
@@ -292,7 +279,6 @@ def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
     axes.axhline(0.0, color='0.4', linewidth=0.8)
     axes.set(title=f'folded by {period} pulses', xlabel=f'trigger pulse, modulo {period}',
              ylabel='pulse error [µs]')
-    add_legend(axes)
 
 
 def _thinned(values: Array) -> Array:

@@ -12,10 +12,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import joint_characteristic
@@ -24,7 +23,6 @@ from sa_jitter_ros.prediction.influence import (
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, with_effects
 from scipy.linalg import toeplitz
 
-Array = NDArray[Any]
 
 _MOST_LAGS = 25
 _SMALL = 1e-5  # s; sets the step at which the characteristic function gives a variance

@@ -20,17 +20,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import effects_of
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.number_text import HALF_95, order_text
 from sa_jitter_ros.report import evidence_figures
-from sa_jitter_ros.report.plotting import (
-    add_legend, AFTER, arrange, BEFORE, MEASURED, panels, with_effects)
+from sa_jitter_ros.report.plotting import AFTER, arrange, BEFORE, MEASURED, panels, with_effects
 
-Array = NDArray[Any]
 
 _FEWEST_CYCLES = 3
 _MOST_PANELS = 3
@@ -130,7 +128,6 @@ def _residual_figure(trace: Trace) -> Figure:
         axes[0].plot(position, expected.attenuation[held_out].mean(axis=0), '_', color=colour,
                      markersize=12, markeredgewidth=2, label=f'predicted, {label}')
     axes[0].set_ylabel('attenuation\n(1: no loss)')
-    add_legend(axes[0])
     for row, (label, colour, _, residual) in zip(axes[1:], versions):
         half = HALF_95 * residual.standard_error
         row.bar(position, 2.0 * half, bottom=-half, color='0.85', label='95 % band',
@@ -141,7 +138,6 @@ def _residual_figure(trace: Trace) -> Figure:
         row.use_sticky_edges = False
         row.margins(y=0.08)
         row.set_ylabel('observed minus predicted')
-        add_legend(row)
     step = max(1, orders.size // 30)
     names = [order_text(g, trace.observation.name_of(g)) for g in orders[::step]]
     axes[-1].set_xticks(np.arange(orders.size)[::step], names,
@@ -169,7 +165,6 @@ def _distribution_figure(trace: Trace) -> Figure:
             one.plot(x, expected.mean_cdf(trace.held_out, line, x), color=colour, label=label)
         one.set(title=f'{trace.observation.words(order)}, {channel}',
                 xlabel='amplitude / mean level', ylabel='cumulative share')
-        add_legend(one)
     _probability_panel(trace, axes[-1])
     return figure
 
@@ -182,7 +177,6 @@ def _probability_panel(trace: Trace, axes: Axes) -> None:
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
     axes.set(title='all lines', xlabel='predicted probability',
              ylabel='cumulative share')
-    add_legend(axes)
 
 
 def _most_telling(trace: Trace) -> list[int]:

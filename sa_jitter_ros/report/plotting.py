@@ -42,21 +42,24 @@ def panels(count: int, *, one_axis: bool = False) -> tuple[Figure, list[Axes]]:
     return figure, axes
 
 
-def add_legend(panel: Axes) -> None:
+def _add_legend(panel: Axes) -> None:
     """Add the legend where it hides no data: below a panel, above one without a title."""
-    below = bool(panel.get_title())
-    panel.legend(fontsize='small', ncols=_columns(panel.get_legend_handles_labels()[1]),
-                 loc='upper center' if below else 'lower left',
-                 bbox_to_anchor=(0.5, -_LABELS / _HEIGHT) if below else (0.0, 1.0),
-                 borderaxespad=0.0, frameon=False)
+    below, labels = bool(panel.get_title()), panel.get_legend_handles_labels()[1]
+    if labels:
+        panel.legend(fontsize='small', ncols=_columns(labels),
+                     loc='upper center' if below else 'lower left',
+                     bbox_to_anchor=(0.5, -_LABELS / _HEIGHT) if below else (0.0, 1.0),
+                     borderaxespad=0.0, frameon=False)
 
 
 def arrange(figure: Figure) -> None:
     """
-    Give all panels the same size, and make room for what stands around them now.
+    Give all panels legends and the same size, and make room for what stands around them.
 
     The layouts of matplotlib measure all texts for that, which takes as long as to draw them.
     """
+    for panel in figure.axes:
+        _add_legend(panel)
     rooms = [_room(panel, panel is figure.axes[-1]) for panel in figure.axes]
     height = top = sum(above + _HEIGHT + below for above, below in rooms)
     figure.set_size_inches(_WIDTH, height)

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.number_text import order_words, percent_text
-from sa_jitter_ros.report.report import (
-    change_text, other_numbers, parameters_text, refinements)
+from sa_jitter_ros.report.report import change_text, other_numbers, parameters_text, refinements
 
 Json = Any
 

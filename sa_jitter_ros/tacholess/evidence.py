@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from scipy.special import gammaincc
 
-FloatArray = NDArray[np.float64]
 
 _FOREIGN = 0.05  # of all bins hold a peak of something else
 _ABSENT = 0.3  # of the time a line of the machine is not to be seen

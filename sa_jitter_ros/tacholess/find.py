@@ -13,7 +13,8 @@
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.parameters import number, numbers
@@ -21,7 +22,6 @@ from sa_jitter_ros.tacholess.found import among, FoundPulses
 from sa_jitter_ros.tacholess.phase import Phase, phase_of, UNKNOWN
 from sa_jitter_ros.tacholess.rough import PRESENT, Rough, rough_speed
 
-FloatArray = NDArray[np.float64]
 
 _MOST_ORDERS = 8  # of which the phase is looked at
 _BAND = 0.45  # of the sampling rate, up to which lines are used
@@ -105,7 +105,7 @@ def _checked(vibration: ArrayLike) -> FloatArray:
     return np.where(np.isfinite(samples), samples, np.nan).astype(np.float64)
 
 
-def _longest(present: NDArray[np.bool_], gap: int) -> tuple[int, int]:
+def _longest(present: BoolArray, gap: int) -> tuple[int, int]:
     """Return begin and end of the longest stretch (item,) without a gap of more than `gap`."""
     known = np.flatnonzero(present)
     if not known.size:

@@ -17,15 +17,14 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import BoolArray, ComplexArray, FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import numbers
 from sa_jitter_ros.tacholess.phase import Phase
 from scipy.sparse import csr_matrix
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _MOST_PULSES = 6000  # of which the covariance is given at once: 300 MB
 _WINDOWS = 8  # averages of a recording for which their attenuation is found
@@ -49,7 +48,7 @@ class ExpectedAmplitudes:
     attenuation: FloatArray
     standard_deviation: FloatArray
     factor: FloatArray
-    used: NDArray[np.bool_]
+    used: BoolArray
 
 
 @dataclass(frozen=True)
@@ -212,7 +211,7 @@ class FoundPulses:
         return CorrectedAmplitudes(amplitudes, errors, expected, how)
 
 
-def among(orders: FloatArray, others: Sequence[float]) -> NDArray[np.bool_]:
+def among(orders: FloatArray, others: Sequence[float]) -> BoolArray:
     """Return which orders (order,) are among others."""
     return np.asarray(np.isclose(orders[:, None], others, rtol=_SAME, atol=0.0).any(axis=1))
 

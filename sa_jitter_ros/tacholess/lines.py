@@ -11,16 +11,14 @@
 """Lines of the machine in short cells along an angle: complex amplitudes, and their noise."""
 
 from dataclasses import dataclass
-from typing import Any
 import warnings
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, ComplexArray, FloatArray
 from sa_jitter_ros.tacholess.path import best_path
 from scipy.ndimage import uniform_filter1d
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _PIECE = 1 << 19  # samples of a channel at a time, so that memory stays small
 _CAP = 4.0  # amplitude over noise beyond which a line has no more to say of the first phase
@@ -103,17 +101,17 @@ class _Tapers:
         self._rising = np.sin(0.5 * np.pi * np.remainder(place, 1.0)) ** 2
         self._weight = self._sums(np.ones(place.size))
 
-    def _sums(self, values: NDArray[Any]) -> NDArray[Any]:
+    def _sums(self, values: Array) -> Array:
         whole = np.add.reduceat(values, self._bounds)
         up = np.add.reduceat(values * self._rising, self._bounds)
         return np.asarray(up[:-1] + (whole - up)[1:])
 
-    def means(self, values: NDArray[Any]) -> NDArray[Any]:
+    def means(self, values: Array) -> Array:
         """Return for each cell the weighted mean of values (sample,)."""
         return np.asarray(self._sums(values) / self._weight)
 
 
-def noise_power(values: NDArray[Any]) -> FloatArray:
+def noise_power(values: Array) -> FloatArray:
     """
     Return the power (line, cell) of the noise of cells, from their changes.
 

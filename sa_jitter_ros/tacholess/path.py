@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-FloatArray = NDArray[np.float64]
 
 RULED_OUT = -20.0  # nats, more than a frame of any comb loses
 # A step of the path up to this share of the largest one costs so many nats.

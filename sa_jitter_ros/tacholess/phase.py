@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.tacholess.lines import Cells, demodulated, first_correction, noise_power
 from sa_jitter_ros.tacholess.smoother import fitted, MOST_OWN, Posterior, Seen, STARTS, Walk
@@ -21,8 +22,6 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.sparse import csr_matrix
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 UNKNOWN = ('the lines are too weak, change too fast, or do not turn together, to follow their '
            'phase without losing turns: give other orders or another sensor')

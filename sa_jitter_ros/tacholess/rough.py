@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.tacholess.evidence import comb, CombSpectra, spectra_of
 from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
 
-FloatArray = NDArray[np.float64]
 
 _WINDOWS = (24.0, 12.0, 6.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
@@ -132,11 +133,11 @@ def _require_one(track: _Track, speed: FloatArray, orders: FloatArray,
     found = _by_order(track.spectra, speed, orders)
     ranged = f'between {low:g} and {high:g} Hz'
     if track.total <= 0.0 or found.max() < PRESENT:
-        raise SignalError(f'no lines of the orders {_text(orders)} stand out {ranged}: give the '
+        raise SignalError(f'no lines of the orders {listed(orders)} stand out {ranged}: give the '
                           'orders that the vibration has, or a sensor nearer to their source')
     if track.other > (_AMBIGUOUS - _FEW / len(orders)**2) * track.total:
         raise SignalError(
-            f'two combs of the orders {_text(orders)} fit, at {np.median(speed):.4g} Hz and at '
+            f'two combs of the orders {listed(orders)} fit, at {np.median(speed):.4g} Hz and at '
             f'{track.other_speed:.4g} Hz: narrow speed_range, or give more orders of the machine')
     edge = np.mean((track.path <= 1) | (track.path >= len(track.speeds) - 2))
     if edge > _AT_EDGE:
@@ -147,13 +148,9 @@ def _require_most(found: Rough, orders: FloatArray) -> None:
     """Raise SignalError unless most orders are there: half of them may be those of a multiple."""
     present = np.count_nonzero(found.evidence > PRESENT)
     if 2 * present <= len(orders):
-        raise SignalError(f'only {present} of the orders {_text(orders)} stand out at '
+        raise SignalError(f'only {present} of the orders {listed(orders)} stand out at '
                           f'{np.median(found.speed):.4g} Hz, which may be a guess: give those '
                           'that the vibration has')
-
-
-def _text(orders: FloatArray) -> str:
-    return ', '.join(f'{order:g}' for order in orders[:6]) + (', ...' if len(orders) > 6 else '')
 
 
 def _finer(vibration: FloatArray, sample_rate: float, orders: FloatArray, rough: Rough,

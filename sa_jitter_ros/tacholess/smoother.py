@@ -25,11 +25,10 @@ from functools import cached_property
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from scipy.linalg import cho_solve_banded, cholesky_banded, LinAlgError
 from scipy.optimize import minimize
 
-FloatArray = NDArray[np.float64]
 
 _SHAFT, _OWN = 3, 2  # states of the shaft, and of a line
 MEMORY = 100.0  # cells that the rate of the phase of a line lasts: about a resonance
