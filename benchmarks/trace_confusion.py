@@ -25,6 +25,7 @@ import math
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.inference.trace_result import Trace
@@ -35,7 +36,7 @@ from sa_jitter_ros.simulation.effect import Effect, IndexArray, Setting
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from sa_jitter_ros.simulation.keyphasor import Keyphasor
-from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
+from sa_jitter_ros.simulation.random_streams import RandomStream
 
 SAMPLE_RATE = 6000.0
 KEYPHASOR_RATE = 5000.0

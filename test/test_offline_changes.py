@@ -19,7 +19,7 @@ import pytest
 from sa_jitter_ros.commands import average
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
-from sa_jitter_ros.offline.change_figure import changes_figure
+from sa_jitter_ros.offline.change_figure import changes_figure, write_figure
 from sa_jitter_ros.offline.changes import find_changes, settings_of
 from sa_jitter_ros.offline.machine_page import write_page
 
@@ -92,7 +92,7 @@ def test_the_figure_shows_what_changed_first(weeks, tmp_path):
     names = [f'day_{number:02d}' for number in range(1, DAYS + 1)]
     changes = find_changes(weeks[1], names, settings_of(
         None, ['allow_uncorrected:=true'], LEARNING))
-    changes.write(tmp_path, figure=True)
+    write_figure(changes, tmp_path)
     assert imread(tmp_path / 'changes.png').ndim == 3
     write_page(weeks[1] / names[-1], changes, place=tmp_path / 'page.html')
     page = (tmp_path / 'page.html').read_text()
@@ -111,7 +111,7 @@ def test_limits_of_days_are_passed_beside_the_changes(weeks, tmp_path):
         'other': {'order': 19.0, 'warn': 99.0, 'channel': 'gearbox'}})
     changes = find_changes(weeks[1], names, settings_of(
         None, ['allow_uncorrected:=true'], LEARNING), machine)
-    changes.write(tmp_path, figure=True)
+    changes.write(tmp_path)
     statistical, fault, mesh = sorted(answer(tmp_path)['changes'], key=lambda item: item['name'])
     assert (fault['kind'], fault['name'], fault['level']) == (
         'limit', f'bearing order {BEARING}', 'warn')
@@ -253,7 +253,7 @@ def test_days_are_compared_with_days_of_their_load(loads, tmp_path):
         None, ['allow_uncorrected:=true', 'state_bin:=100.0'], LEARNING), state='1')
     assert changes.baseline == tuple(
         (number if number < 12 else number - 11) <= LEARNING for number in range(1, 25))
-    changes.write(tmp_path, figure=True)
+    write_figure(changes, tmp_path)
     assert imread(tmp_path / 'changes.png').ndim == 3
 
 

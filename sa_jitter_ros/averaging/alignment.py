@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import (PulseErrorFit, PulseErrorProblem,
                                                      real_parts)
 
-FloatArray = NDArray[np.float64]
 
 # Relative step of a precision, in the derivative of a covariance.
 _STEP = 1e-3

@@ -32,12 +32,11 @@ from math import pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.noise import row_medians
 from scipy import fft
 from scipy.special import chndtrix, erf
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # Cycles from which on the spectrum near zero is used, at least so many lines of it, and their
 # share of the cycles.

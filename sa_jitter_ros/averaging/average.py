@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.amplitude_errors import AmplitudeErrors
 from sa_jitter_ros.averaging.envelope import Envelope, EnvelopeSettings
 from sa_jitter_ros.averaging.interpolator_gain import mean_gain
@@ -28,8 +29,6 @@ from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses, PulseValidator
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 AVERAGING = ('block', 'sliding', 'exponential')
 

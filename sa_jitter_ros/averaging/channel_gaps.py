@@ -20,12 +20,10 @@ from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.cycle import CycleSamples
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Result = TypeVar('Result')
 
 _CONSTANT = 1e-9  # relative scatter of a constant that was resampled

@@ -17,6 +17,7 @@ import math
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected_errors,
                                                       kurtosis_of, Repeatability, Scatter)
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
@@ -31,8 +32,6 @@ from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Grid = tuple[FloatArray, GridCycles, NDArray[np.bool_]]
 
 _ROUNDS = 2  # of the search for displaced pulses

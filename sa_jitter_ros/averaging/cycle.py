@@ -30,15 +30,13 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray, IntArray
 from sa_jitter_ros.inner_loops import add_products
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_lines, run_times
 from sa_jitter_ros.pulses.resampling import (
     impulse_response, interpolate_along, interpolate_between, margin)
 from scipy.fft import next_fast_len
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ComplexArray = NDArray[np.complex128]
 
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points

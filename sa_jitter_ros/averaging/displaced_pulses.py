@@ -18,12 +18,9 @@ pulse counts as missing: it is put where the vibration has it, and the rest is f
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 
 #: Error of a pulse, over a trigger cycle, up to which it is searched for.
 REACH = 0.15

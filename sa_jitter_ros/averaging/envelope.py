@@ -30,13 +30,13 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.pulses.angle_law import angle_law
 from sa_jitter_ros.pulses.resampling import periodic
 from scipy.fft import fft, ifft, next_fast_len
 
-FloatArray = NDArray[np.float64]
 
 #: Slip: how far from a bearing order the line that stands out may be, relative to it.
 SLIP = 0.02

@@ -21,12 +21,11 @@ from math import pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.spectral_lines import line_limit, peaks, spectrum
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import rfft
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32

@@ -65,16 +65,16 @@ Standard errors are by the jackknife over parts of the cycles of an average (`ja
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.amplitude_errors import widened
 from sa_jitter_ros.averaging.jackknife import jackknife_variance, PARTS, WaveformParts
 from sa_jitter_ros.errors import ParameterError, SignalError
 from scipy.fft import ifft, next_fast_len
 
-Array = NDArray[Any]
 
 INDICATORS: tuple[str, ...] = (
     'rms', 'peak', 'crest_factor', 'kurtosis', 'fm0', 'fm4', 'm6a', 'm8a', 'na4',

@@ -21,11 +21,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.pulses.resampling import gain_below_nyquist
 
-FloatArray = NDArray[np.float64]
 
 #: The least gain by which an amplitude is divided.
 LEAST_GAIN = 0.5

@@ -21,13 +21,11 @@ for the first and second order, and 1.25 times the variance for the fourth.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.running_mean import BlockMean
 
-Array = NDArray[Any]
 
 #: Parts of the cycles of an average.
 PARTS = 3

@@ -10,12 +10,9 @@
 
 """The latest rows of a series, as one array."""
 
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[Any]
+from sa_jitter_ros.arrays import Array
 
 
 class LatestRows:

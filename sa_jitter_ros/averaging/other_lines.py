@@ -21,11 +21,10 @@ cycles; so do those that pulse errors make beside an order, on both of its sides
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.synchronous_orders import significance
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # Cycles from which on lines are told from changes of the orders, and most lines.
 _LEAST_CYCLES, _MOST = 8, 16

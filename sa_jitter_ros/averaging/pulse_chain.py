@@ -19,10 +19,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from scipy.linalg import lapack
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,11 @@ from math import factorial, pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_chain import shortest_path, Tridiagonal
 from scipy.linalg import lapack, qr
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _NODE_ERROR = 1e-4
 _MOST_NODES = 20

@@ -23,11 +23,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _FEWEST = 2  # pulses of each mark in an average
 _MEMORY = 50.0  # averages

@@ -31,10 +31,11 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.alignment import Alignment, alignment
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
-from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
-                                                     PulseErrorFit, PulseErrorProblem)
+from sa_jitter_ros.averaging.pulse_error_fit import (
+    compress, nodes_for, PulseErrorFit, PulseErrorProblem)
 from sa_jitter_ros.averaging.synchronous_orders import LineSearch, significant_orders
 from sa_jitter_ros.errors import ParameterError, SignalError
 

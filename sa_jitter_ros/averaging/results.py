@@ -17,13 +17,12 @@ Layouts are those of the topics of `synchronous_averager`: `<shaft>/synchronous_
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.envelope import Envelope
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.shaft_indicators import best_of, ShaftIndicators
 
-FloatArray = NDArray[np.float64]
 
 AMPLITUDE_FIELDS = (
     'order', 'raw_amplitude', 'raw_phase', 'corrected_amplitude', 'corrected_phase',

@@ -22,16 +22,14 @@ Undefined values are NaN.
 (array([3.]), array([1.528]), 3)
 """
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.inner_loops import add_steps
 
 _CACHED = 1 << 16  # numbers
-
-Array = NDArray[Any]
-FloatArray = NDArray[np.float64]
 
 
 def _power(values: Array) -> FloatArray:

@@ -24,6 +24,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.amplitude_errors import Repeatability, waveform_error
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
@@ -38,8 +39,6 @@ from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, Pa
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law, LINEAR_LAW
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # Cycles from which on it is not known how many come.
 _ALL_CYCLES = 1 << 40

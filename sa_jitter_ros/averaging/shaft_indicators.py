@@ -20,13 +20,11 @@ from dataclasses import replace
 from threading import Lock
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average, Correction
 from sa_jitter_ros.averaging.indicators import (
     ConditionIndicators, gear_lines, GearSettings, RunningIndicators, separate)
 from sa_jitter_ros.errors import ParameterError, SignalError
-
-FloatArray = NDArray[np.float64]
 
 
 def best_of(average: Average) -> Average | Correction:

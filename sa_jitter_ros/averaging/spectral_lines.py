@@ -14,11 +14,11 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.noise import row_medians
 from scipy.fft import rfft
 from scipy.special import gammainccinv
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 #: A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor.

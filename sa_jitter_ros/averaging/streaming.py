@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.correction import CorrectingAverager, LatestGrid
 from sa_jitter_ros.averaging.cycle import CycleSamples
@@ -34,8 +35,6 @@ from sa_jitter_ros.pulses.angle_law import angle_law
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.samples import SampleBlock
-
-FloatArray = NDArray[np.float64]
 
 
 #: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here; `skipped` are the

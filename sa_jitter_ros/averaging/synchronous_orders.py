@@ -26,14 +26,12 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray, IntArray
 from sa_jitter_ros.averaging.grid_cycles import BAND, cycle_weights, GridCycles
 from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import CompressedCycles
 from scipy.ndimage import median_filter
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 
 # Probability that noise alone passes as a synchronous order in any of the orders and channels.
 _FALSE_ALARM = 1e-3

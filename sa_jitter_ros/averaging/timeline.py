@@ -20,12 +20,11 @@ from dataclasses import dataclass, field
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.inner_loops import frames, room
 from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved_times
 
-FloatArray = NDArray[np.float64]
 _Span = tuple[int, int]  # first index, and the one behind the last
 
 SAME_RATE = 1e-9  # relative difference of sampling rates that are equal to rounding

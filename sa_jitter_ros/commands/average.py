@@ -128,9 +128,11 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     found = find_changes(
         options.output, [job.name for job in jobs if job.name in averaged], settings,
         jobs[0].machine.machine, state=options.state)
-    found.write(options.output, figure=not options.no_figures)
+    found.write(options.output)
     if not options.no_figures:
+        from sa_jitter_ros.offline.change_figure import write_figure
         from sa_jitter_ros.offline.machine_page import PAGE, write_page
+        write_figure(found, options.output)
         write_page(options.output / found.recordings[-1].name, found, place=options.output / PAGE)
     for line in found.warnings():
         progress.say(f'warning: {line}')

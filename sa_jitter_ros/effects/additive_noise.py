@@ -15,9 +15,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import (
-    absent, Array, beyond_chance, DirectEffect, Effect, Finding, largest_power, ODDS, parameter,
-    weighed)
+    absent, beyond_chance, DirectEffect, Effect, Finding, largest_power, ODDS, parameter, weighed)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel

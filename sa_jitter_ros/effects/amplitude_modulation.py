@@ -18,11 +18,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, memory, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
 from sa_jitter_ros.effects.common_gain import CommonGain, fit_common_gain
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
+    absent, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel

@@ -15,13 +15,12 @@ Frequencies are in units of the trigger rate, times in trigger cycles.
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import unit_nodes
 
-Array = NDArray[Any]
 
 #: Of what wanders or modulates, as a fraction of the trigger rate: below half of it by definition.
 #: It may be slower than any record, as load and temperature are.

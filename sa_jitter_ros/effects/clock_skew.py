@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import Effect, parameter
 from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods

@@ -17,14 +17,12 @@ order alone changes by itself as noise does, by the power of the highest octave 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import ONE_SIDED
 from scipy.optimize import minimize
 
-Array = NDArray[Any]
 
 _LEAST = 0.1  # of the noise: what a line changes by itself at least
 _RANGE = 25.0  # of logarithms of a power

@@ -16,7 +16,8 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import Effect, parameter, require_in_turn
 from sa_jitter_ros.effects.timing import (
     autoregressive, FAINT, LARGE, PULSES, ROUNDING, Setting, Spectrum)
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianPulseJitter

@@ -21,7 +21,7 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
@@ -31,7 +31,6 @@ from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-Array = NDArray[Any]
 
 #: Chance of what is beyond a limit, and of what is taken for decided and is not.
 RARE = 0.05

@@ -17,17 +17,14 @@ effects that were added before (`explained`) are subtracted.
 
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.influence import (
     AveragePulses, declared_jitter, Influence, mean_period)
 from sa_jitter_ros.prediction.model import DeclaredModel
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import Effect, parameter, require_in_turn
 from sa_jitter_ros.effects.timing import FAINT, LARGE, PULSES, Setting, Spectrum, white
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal

@@ -15,8 +15,9 @@ import math
 from typing import ClassVar
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter, require_below, weighed)
+    absent, DirectEffect, Effect, Finding, ONE_SIDED, parameter, require_below, weighed)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import MOST_NOISE

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, DirectEffect, Finding, parameter
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding, parameter
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel

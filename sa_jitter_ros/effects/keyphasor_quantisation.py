@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import (
-    Array, Effect, most_scenarios, parameter, require_in_turn)
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import Effect, most_scenarios, parameter, require_in_turn
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.lattice import Clock, SLOPE_OFF
 from sa_jitter_ros.effects.timing import Pattern, Setting

@@ -12,15 +12,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.pulses.clock_grid import find_grid
 from scipy import special
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-Array = NDArray[Any]
 
 #: Relative difference of rates below which two clocks count as one.
 SAME_RATE = 0.01

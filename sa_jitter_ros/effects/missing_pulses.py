@@ -24,9 +24,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import legendre
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import INSIDE
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, most_scenarios, parameter, RARE)
+    absent, DirectEffect, Effect, Finding, most_scenarios, parameter, RARE)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, joint_characteristic
 from sa_jitter_ros.prediction.influence import AveragePulses, mean_period

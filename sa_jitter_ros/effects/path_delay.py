@@ -22,7 +22,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import Effect, parameter
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel

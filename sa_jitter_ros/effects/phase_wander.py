@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND, slow_band,
     slow_memory, WIDEST)
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
+from sa_jitter_ros.effects.effect import Effect, parameter, require_below
 from sa_jitter_ros.effects.timing import FAINT, LARGE, low_passed, Setting, SOURCE, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel

@@ -16,10 +16,11 @@ from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, even_in, fading, NARROWEST, ripple_of_acceleration, slow_band, slow_memory,
     WIDEST)
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
+from sa_jitter_ros.effects.effect import Effect, parameter, require_below
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import Covariance, PulseWeights

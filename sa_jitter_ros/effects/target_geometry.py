@@ -21,8 +21,8 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import (
-    Array, Effect, most_scenarios, ODDS, parameter, require_in_turn)
+from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import Effect, most_scenarios, ODDS, parameter, require_in_turn
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods

@@ -20,14 +20,12 @@ Sizes are in parts of a `unit` (s), frequencies in cycles a trigger cycle.
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-Array = NDArray[Any]
 
 PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
 #: Logarithms of a power, in unit^2, below which there is as good as none, and that none exceeds.

@@ -18,17 +18,15 @@ of the line. The mean loss follows from the depth of the beat; raw and corrected
 it, so that their ratio does not show it. Beats slower than half the trigger rate are found.
 """
 
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.evidence import Beat
 from sa_jitter_ros.pulses.resampling import interpolator_gain
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
-Array = NDArray[Any]
 
 METHODS = ('linear', 'cubic', 'spline')
 _KNOWN = 0.03  # error of the shape

@@ -19,17 +19,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.spectral_lines import top_between
 from sa_jitter_ros.inference.cycle_reader import CycleReader
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-Array = NDArray[Any]
 
 # Cycles on either side whose mean phasors are compared, most and fewest, and of a sudden change.
 _BESIDE, _FEWEST, _SUDDEN = 24, 8, 4

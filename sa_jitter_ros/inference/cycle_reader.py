@@ -13,7 +13,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.shaft import ShaftAverager
@@ -21,8 +21,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import margin
 
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 #: Samples on either side of a cycle, for interpolation and corrected pulses.
 MARGIN = 40

@@ -28,6 +28,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, ComplexArray
 from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
@@ -38,8 +39,6 @@ from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_solve
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 # Bends in parts of the declared jitter, and gains: a first guess when they become free, and the

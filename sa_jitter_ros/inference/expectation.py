@@ -21,11 +21,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import chain, product
 import math
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.inference.cycle_reader import kept_apart
 from sa_jitter_ros.inference.observation import Acquisition, Observation
@@ -42,7 +42,6 @@ from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import COARSEST, SampledDistribution
 from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES
 
-Array = NDArray[Any]
 
 Distribution = AmplitudeDistribution | SampledDistribution
 

@@ -18,13 +18,11 @@ acquisition has by chance is in both. A tie is no harm.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import Finding
 
-Array = NDArray[Any]
 
 #: Standard errors of a paired difference from which on it is one.
 CERTAIN = 2.0

@@ -13,10 +13,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
@@ -33,7 +32,6 @@ from sa_jitter_ros.prediction.influence import AveragePulses, known_errors, with
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-Array = NDArray[Any]
 
 #: Of its order's strongest channel, from which on a line is worth comparing.
 STRONG = 0.2

@@ -22,10 +22,9 @@ pattern, whose sizes have either sign, it is the size of which estimates as smal
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
@@ -40,7 +39,6 @@ from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
 from scipy import special
 
-Array = NDArray[Any]
 
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
 

@@ -18,10 +18,9 @@ follow the speed. No effect of the package does that.
 
 from collections.abc import Iterator
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
@@ -31,7 +30,6 @@ from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
 from scipy import special
 
-Array = NDArray[Any]
 
 LINES = 'lines'
 _TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, ComplexArray, FloatArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
@@ -46,9 +47,6 @@ from sa_jitter_ros.recordings.channel_check import stuck
 from sa_jitter_ros.recordings.limits import MAX_VALUES
 from sa_jitter_ros.recordings.recording import Recording
 
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
 NameOf = Callable[[float], str]  # of an order
 

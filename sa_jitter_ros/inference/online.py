@@ -14,10 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.cycle import exact_cycles
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import RESOLUTION
@@ -27,7 +26,6 @@ from sa_jitter_ros.inference.residual import Residual, residual
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.special import ndtr
 
-Array = NDArray[Any]
 
 _NOISE = 0.1  # of its amplitude that a line may scatter by
 _MOST_PULSES = 1000  # per revolution

@@ -19,10 +19,10 @@ off line.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
@@ -40,7 +40,6 @@ from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-Array = NDArray[Any]
 
 _DECISIVE = 'close_loop on a recording, which contains the signals within trigger cycles,'
 _REASON = 'the topics do not contain {}: run close_loop on a recording'

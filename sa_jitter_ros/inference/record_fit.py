@@ -22,6 +22,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, ComplexArray
 from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
@@ -32,8 +33,6 @@ from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 # Steps that a search may take; what its last one may change, in standard errors.
 _MOST_STEPS, _SETTLED = 20, 0.1

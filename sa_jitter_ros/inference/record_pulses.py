@@ -14,16 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.recordings.recording import Recording
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: Of the declared speed, relative.
 SPEED_TOLERANCE = 0.1

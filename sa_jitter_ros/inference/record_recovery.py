@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.order_band import band_end
@@ -34,7 +34,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from scipy import special
 
-FloatArray = NDArray[np.float64]
 
 _EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch

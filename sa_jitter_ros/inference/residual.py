@@ -18,13 +18,11 @@ significance counts acquisitions, two neighbours as one block, and keeps the lin
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from scipy import special
 
-Array = NDArray[Any]
 
 #: Accuracy of a predicted attenuation: smaller residuals do not change the verdict.
 ACCURACY = 3e-3

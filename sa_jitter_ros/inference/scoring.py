@@ -17,10 +17,9 @@ the scatter that noise, jitter and effects predict.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.effect import Finding, possible
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
@@ -36,7 +35,6 @@ from sa_jitter_ros.prediction.amplitudes import component_gain
 from sa_jitter_ros.prediction.influence import AveragePulses
 from scipy import special
 
-Array = NDArray[Any]
 
 _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 

@@ -23,7 +23,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import (
@@ -54,7 +54,6 @@ from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-Array = NDArray[Any]
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve

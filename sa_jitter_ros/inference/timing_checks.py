@@ -17,10 +17,9 @@ Each has a p value from draws of the fitted model. None names a culprit.
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.effects.timing import MOTION, PULSES, SOURCE
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser, SIDEBANDS
@@ -28,7 +27,6 @@ from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, Timi
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import EDGE, through
 
-Array = NDArray[Any]
 
 _DECLARED, _SCALED, _TICKS = 'declared', 'scaled', 'ticks'
 #: Draws of what is there by chance, and their seed.

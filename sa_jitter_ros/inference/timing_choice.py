@@ -25,7 +25,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, possible, RARE
@@ -38,7 +38,6 @@ from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
 
-Array = NDArray[Any]
 
 #: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
 RIPPLE = 'ripple'

@@ -22,14 +22,12 @@ the motion of the shaft from leaking.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import recovered, recovered_shapes
 from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
 
-Array = NDArray[Any]
 
 _NEXT = 1
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.

@@ -20,17 +20,15 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import count
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.timing import (
     FAINT, LARGE, MOTION, Pattern, PULSES, ROUNDING, Spectrum, white)
 from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
 
-Array = NDArray[Any]
 
 #: What is always there: the motion of the shaft, the declared jitter, the noise of the recovery.
 SHAFT, JITTER, NOISE = 'shaft', 'jitter_scale', 'noise'

@@ -18,10 +18,9 @@ over a normal one of the same size.
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.inference.residual import DRAWS
 from sa_jitter_ros.inference.timing_data import of_measured, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
@@ -29,7 +28,6 @@ from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from scipy.fft import irfft, rfft
 from scipy.special import ndtr
 
-Array = NDArray[Any]
 
 EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see

@@ -12,9 +12,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.evidence import Evidence
@@ -29,7 +28,6 @@ from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.inference.unsteady import UnsteadyLine
 
-Array = NDArray[Any]
 HARMS = 'held-out acquisitions are predicted worse with it than with the declared model'
 
 

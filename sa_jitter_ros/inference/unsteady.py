@@ -17,16 +17,14 @@ the attenuation hold beside it, those of amplitudes do not.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.number_text import percent_text
 from scipy import special
 
-Array = NDArray[Any]
 
 #: Relative scatter of an amplitude from average to average that steady machines were measured to
 #: have and that no effect describes (docs/measured_cases.md).

@@ -19,9 +19,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from scipy.sparse import _sparsetools
 
-FloatArray = NDArray[np.float64]
 
 _PIECE = 1 << 11  # positions whose weights are in the cache at once
 

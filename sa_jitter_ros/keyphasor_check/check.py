@@ -20,7 +20,7 @@ from dataclasses import replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
@@ -45,7 +45,6 @@ from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-FloatArray = NDArray[np.float64]
 
 _MOST_MARKS, _MOST_ENCODER = 72, 4096  # of any number, and of usual ones
 _SYMMETRY = 1.5  # log probability that a pattern repeats in a revolution

@@ -11,11 +11,10 @@
 """The clock that timed the pulses, or the last decimal of their times."""
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.effects.lattice import Clock, NO_CLOCK
 from sa_jitter_ros.pulses.clock_grid import find_grid
 
-FloatArray = NDArray[np.float64]
 
 _MOST = 4000
 _FEWEST = 12

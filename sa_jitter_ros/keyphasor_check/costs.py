@@ -15,7 +15,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.effects.library import predict
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.clock import is_decimal
@@ -24,7 +24,6 @@ from sa_jitter_ros.keyphasor_check.result import Checked, Warn
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
 from sa_jitter_ros.keyphasor_check.wheel import patterns
 
-FloatArray = NDArray[np.float64]
 Losses = tuple[FloatArray, FloatArray]
 
 #: Orders of which costs are given where none was found.

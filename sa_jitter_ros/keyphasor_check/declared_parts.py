@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.keyphasor_check.lines import ToothLines
 from sa_jitter_ros.keyphasor_check.result import Warn
 from sa_jitter_ros.machine import Machine
 
-FloatArray = NDArray[np.float64]
 
 _NEAR = 1.5  # bins from the place of a part at which a line is still its own
 _MISCOUNTED = (-3, -2, -1, 1, 2, 3)  # teeth

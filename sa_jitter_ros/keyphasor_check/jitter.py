@@ -22,8 +22,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 
 _FEWEST = 24
 _LOWEST = 0.02  # cycles a pulse, below which the motion has any spectrum

@@ -24,11 +24,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len, rfft
 
-FloatArray = NDArray[np.float64]
 
 _MOST_VALUES = 3_000_000
 _MOST_POINTS = 600_000

@@ -20,12 +20,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.keyphasor_check.teeth import joined_parts, nearest_pulses, NumberedPulses
 from sa_jitter_ros.keyphasor_check.wheel import Marking, pattern_of
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _ROUNDS = 2
 _OUTLIER = 8.0  # robust standard deviations

@@ -16,7 +16,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import find_lines
@@ -27,7 +27,6 @@ from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-FloatArray = NDArray[np.float64]
 
 _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000

@@ -23,11 +23,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from scipy.ndimage import rank_filter, uniform_filter1d
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: Pulses from which on a target can be numbered.
 FEWEST = 6

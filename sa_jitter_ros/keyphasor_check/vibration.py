@@ -21,7 +21,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.errors import SaJitterError
@@ -29,7 +29,6 @@ from sa_jitter_ros.keyphasor_check.jitter import Jitter
 from sa_jitter_ros.keyphasor_check.result import Checked
 from scipy import special
 
-FloatArray = NDArray[np.float64]
 
 _FEWEST_AVERAGES = 3
 _FEWEST_SPEEDS = 6

@@ -22,13 +22,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from sa_jitter_ros.keyphasor_check.teeth import NumberedPulses
 from sa_jitter_ros.pulses.target import index_of
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 _MOST_TEETH = 1200
 _FEWEST_REVOLUTIONS = 4

@@ -11,6 +11,7 @@
 """Figure of what has changed: the trends of the quantities over all recordings."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,11 +19,16 @@ import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.monitoring.monitor import ShaftMonitor
-from sa_jitter_ros.offline.changes import Changes, Key, key_of
+from sa_jitter_ros.offline.changes import Changes, FIGURE, Key, key_of
 from sa_jitter_ros.offline.plotting import draw_limits, legend_under, MARK, MEASURED
 
 _PANELS = 6
 _MOST_TICKS = 12
+
+
+def write_figure(changes: Changes, output: Path) -> None:
+    """Write `changes.png`; raises OSError."""
+    changes_figure(changes).savefig(output / FIGURE, dpi=110)
 
 
 def changes_figure(changes: Changes) -> Figure:

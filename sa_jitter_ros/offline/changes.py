@@ -119,13 +119,10 @@ class Changes:
             'left_out': dict(self.left_out)})
         return found
 
-    def write(self, output: Path, *, figure: bool) -> None:
-        """Write `changes.json`, and `changes.png` with a `figure`; raises OSError."""
+    def write(self, output: Path) -> None:
+        """Write `changes.json`; raises OSError."""
         text = json.dumps(self.report(), indent=1, allow_nan=False)
         write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
-        if figure:
-            from sa_jitter_ros.offline.change_figure import changes_figure
-            changes_figure(self).savefig(output / FIGURE, dpi=110)
 
     def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
         return {**item.content(), 'channel': self.recordings[0].channels[item.channel],

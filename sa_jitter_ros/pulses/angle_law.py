@@ -31,14 +31,12 @@ to terms of the order eps^2 per trigger cycle. For the linear law it is Eq. 16 o
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 
-Array = NDArray[Any]
-FloatArray = NDArray[np.float64]
 #: ``covariance(u, v, lag)`` = Cov[e_k(u), e_{k+lag}(v)] in fundamental cycles squared.
 Covariance = Callable[[Array, Array, int], Array]
 

@@ -19,10 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _BLOCK = 16  # steps from which those of the next block are judged
 _LONGEST = 4  # samples of a glitch

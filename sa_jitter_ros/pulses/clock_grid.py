@@ -19,9 +19,8 @@ ticks those that are nearly equal, from which it follows step by step over longe
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 
 _FEWEST = 6  # intervals
 _DIFFERENT = 0.5  # most of the intervals that differ from all others

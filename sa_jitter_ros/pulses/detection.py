@@ -25,6 +25,7 @@ import warnings
 
 import numpy as np
 import numpy.typing as npt
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import DataWarning, SignalError
 from sa_jitter_ros.parameters import number, Values
 from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS, OPTIONS
@@ -34,7 +35,6 @@ from sa_jitter_ros.samples import SampleBlock
 __all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'detector_of',
            'pulses_in_blocks', 'spikes_text']
 
-FloatArray = npt.NDArray[np.float64]
 Polarity = Literal['positive', 'negative', 'auto']
 Edge = Literal['rising', 'falling', 'centre']
 _NONE: FloatArray = np.empty(0)

@@ -26,12 +26,11 @@ from math import expm1
 from operator import mul
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 from sa_jitter_ros.pulses.pulse_chain import robust_square
 from sa_jitter_ros.pulses.pulse_paths import LevelPrediction, OTHER, REACH
 
-FloatArray = NDArray[np.float64]
 
 _PLACE = np.arange(1, REACH + 1) - 0.5 * (REACH + 1)  # of the latest interval last
 _LINE = 1.0 / REACH + _PLACE * 0.5 * (REACH + 1) / float(np.sum(_PLACE**2))

@@ -20,12 +20,11 @@ than most, and by these alone the marks differ.
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.pulses.clock_grid import clock_tick
 from sa_jitter_ros.pulses.target import EvenTarget, Target
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
-FloatArray = NDArray[np.float64]
 
 _MARKS = 4  # of more, one that is loose spoils few trigger cycles that the judge does not drop
 # Revolutions fitted at once, odd so that most pulses are on one side; how many such fits count.

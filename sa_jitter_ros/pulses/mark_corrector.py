@@ -21,13 +21,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.pulses.target_geometry import (
     combined, MarkOffsets, matches, measured_geometry, turned, turned_by)
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _LEARNT, _LONGEST = 100, 3.0  # revolutions and seconds
 _TRIED = (8, 32, _LEARNT)  # revolutions after which the pattern is looked for

@@ -19,12 +19,10 @@ import math
 from operator import itemgetter
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.pulses.pulse_paths import Path, PathRules, Step
 from scipy.ndimage import median_filter
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: cost of a stray among the first pulses of one mark, and of marks that may be uneven
 STRAY_OF_ONE, STRAY_OF_MARKS = 8.0, 10.0

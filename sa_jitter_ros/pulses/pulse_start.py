@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.pulses.interval_model import IntervalModel
 from sa_jitter_ros.pulses.mark_pattern import (
     mark_pattern, regular_start, repeating, steady_pattern)
@@ -31,7 +31,6 @@ from sa_jitter_ros.pulses.target import EvenTarget, Lock, Target
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
-FloatArray = NDArray[np.float64]
 _LONGEST = 3.0  # s in which the marks are learnt
 _FEW_MARKS = 12
 _LACKS_ONE = 1.6  # intervals that are as long as two with a pulse missing between them

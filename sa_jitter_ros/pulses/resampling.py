@@ -28,11 +28,11 @@ import math
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.inner_loops import room, weighted_sums
 from scipy.special import i0
 
-FloatArray = NDArray[np.float64]
 _Places = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
 
 _SPLINE_POLE = np.sqrt(3.0) - 2.0

@@ -24,11 +24,11 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
 
-FloatArray = NDArray[np.float64]
 
 _TURN = 2.0 * math.pi
 _BEFORE, _AFTER = 3, 3  # samples around a crossing

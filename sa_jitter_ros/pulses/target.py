@@ -20,15 +20,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.pulses.mark_pattern import MarkPattern
 from sa_jitter_ros.pulses.pulse_chain import (
     Chain, find_chain, STRAY_OF_MARKS, STRAY_OF_ONE, unsteadiness)
 from scipy.ndimage import median_filter
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 # Pulses from which the interval is learnt: those of this time (s), in these limits.
 _LEARNING_TIME, _FEWEST, _MOST = 1.0, 4, 12

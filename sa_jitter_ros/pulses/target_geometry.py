@@ -20,12 +20,9 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from scipy.ndimage import uniform_filter1d
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _FEWEST = 4
 _ROUNDS = 4  # which missing pulses and teeth need

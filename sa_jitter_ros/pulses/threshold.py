@@ -24,11 +24,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from sa_jitter_ros.arrays import BoolArray, FloatArray
 
 __all__ = ['SchmittTrigger', 'StateLevels', 'state_levels']
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
 
 _BINS = 100
 # Difference of the means of both halves over the noise, which follows from the steps between

@@ -13,11 +13,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
+from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
 __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
-FloatArray = npt.NDArray[np.float64]
 MissingPulses = Literal['break', 'bridge']
 GeometryMode = Literal['none', 'learn', 'given']
 GEOMETRY_MODES = ('none', 'learn', 'given')

@@ -14,11 +14,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
+from sa_jitter_ros.simulation.random_streams import RandomStream
 
-ComplexArray = NDArray[np.complex128]
 
 _MAX_WIDTH = 0.15  # revolutions; beyond it more than two neighbouring bursts overlap
 

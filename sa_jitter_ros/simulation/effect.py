@@ -18,9 +18,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.motion import Motion
-from sa_jitter_ros.simulation.random_streams import band_limited, FloatArray, SinusoidSum, ZERO
+from sa_jitter_ros.simulation.random_streams import band_limited, SinusoidSum, ZERO
 
 IndexArray = NDArray[np.int64]
 Signal = Callable[[FloatArray], FloatArray]

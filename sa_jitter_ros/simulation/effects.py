@@ -23,12 +23,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.effect import (
     BANDWIDTH, Effect, IndexArray, NOT_NEGATIVE, POSITIVE, require_number, Setting, Signal,
     slow_process)
-from sa_jitter_ros.simulation.random_streams import (
-    band_limited, FloatArray, RandomStream, SinusoidSum)
+from sa_jitter_ros.simulation.random_streams import band_limited, RandomStream, SinusoidSum
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtri
 

@@ -23,13 +23,13 @@ from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.simulation.components import ChippedTooth, ComplexArray, Component
+from sa_jitter_ros.simulation.components import ChippedTooth, Component
 from sa_jitter_ros.simulation.effect import Effect, require_number, Setting
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
-from sa_jitter_ros.simulation.random_streams import (
-    FloatArray, in_chunks, RandomStream, SinusoidSum, ZERO)
+from sa_jitter_ros.simulation.random_streams import in_chunks, RandomStream, SinusoidSum, ZERO
 
 CHUNK = 4096
 Chunk = Callable[[int], FloatArray]  # of this number

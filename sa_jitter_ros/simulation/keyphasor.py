@@ -13,9 +13,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.effect import IndexArray, require_number
-from sa_jitter_ros.simulation.random_streams import FloatArray
 
 _WAVEFORMS = ('ttl', 'sine')
 

@@ -20,8 +20,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.simulation.random_streams import FloatArray, SinusoidSum, ZERO
+from sa_jitter_ros.simulation.random_streams import SinusoidSum, ZERO
 
 _MAX_FLUCTUATION = 0.9  # of the upper bound, which is about ten standard deviations
 _MAX_TORSION = 0.5

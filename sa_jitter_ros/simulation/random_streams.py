@@ -19,11 +19,10 @@ from dataclasses import dataclass
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from scipy.signal import lfilter
 
-FloatArray = NDArray[np.float64]
 
 CHUNK = 1024
 _LINES = 48  # sinusoids of a random function
