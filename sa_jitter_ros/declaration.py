@@ -24,7 +24,7 @@ from typing import Any
 
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
-from sa_jitter_ros.errors import ModelError, one_line, ParameterError, SaJitterError
+from sa_jitter_ros.errors import ModelError, ParameterError, quoted, SaJitterError
 from sa_jitter_ros.machine import following, Machine, PREFIX, UNKNOWN
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.parameters import (
@@ -156,5 +156,5 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         taken['sample_rate'] = taken.get('sample_rate') or sample_rate
         declaration = declaration_of(taken)
     except SaJitterError as error:
-        raise ModelError(f'{path}: {one_line(error)}') from error
+        raise ModelError(f'{path}: {quoted(error)}') from error
     return replace(declaration, unknown=unknown_names(values, known), machine=machine)

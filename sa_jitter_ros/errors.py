@@ -14,8 +14,6 @@ Errors that the package raises for bad input.
 Every message states the value, the limit and the remedy.
 """
 
-_LONGEST = 300  # characters of a line that quotes a file
-
 
 class SaJitterError(ValueError):
     """
@@ -112,6 +110,11 @@ class DataWarning(UserWarning):
 
 
 def one_line(message: object) -> str:
-    """Return the text of an error, which may quote a file, as one line of limited length."""
-    text = ' '.join(str(message).split())
-    return text if len(text) <= _LONGEST else f'{text[:_LONGEST]} ...'
+    """Return the text of an error or warning as one line, whole."""
+    return ' '.join(str(message).split())
+
+
+def quoted(message: object, longest: int = 300) -> str:
+    """Return the text of an error that may quote a file, as one line of limited length."""
+    text = one_line(message)
+    return text if len(text) <= longest else f'{text[:longest]} ...'

@@ -18,7 +18,7 @@ import stat
 from types import MappingProxyType
 from typing import Any
 
-from sa_jitter_ros.errors import one_line, ParameterError
+from sa_jitter_ros.errors import ParameterError, quoted
 import yaml
 
 _LARGEST_FILE = 1 << 20
@@ -70,7 +70,7 @@ def _content(path: Path) -> Any:
         raise ParameterError(f'{path}: {error.strerror or error}: give the path of a parameter '
                              'file that can be read') from error
     except Exception as error:  # malformed tags raise exceptions of many types
-        raise ParameterError(f'{path}: cannot be read as YAML: {one_line(error)}') from error
+        raise ParameterError(f'{path}: cannot be read as YAML: {quoted(error)}') from error
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def value_of(text: str) -> Any:
     try:
         return yaml.load(text, _Loader)
     except Exception as error:  # malformed tags raise exceptions of many types
-        raise ParameterError(f'{text}: cannot be read as YAML: {one_line(error)}') from error
+        raise ParameterError(f'{text}: cannot be read as YAML: {quoted(error)}') from error
 
 
 def shipped(name: str) -> Path:

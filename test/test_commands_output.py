@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands import (
     average, check_keyphasor, close_loop, layouts, loop_run, progress)
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameter_file import shipped
 
 
@@ -69,6 +70,18 @@ def test_stopped_loop_says_so_in_one_line_and_writes_nothing(tmp_path, capsys, m
                             '--output', str(tmp_path / 'report')]) == 130
     assert capsys.readouterr().err == 'close_loop: stopped before the report was written\n'
     assert not (tmp_path / 'report' / 'report.json').exists()
+
+
+def test_error_of_a_command_is_one_line_with_its_remedy(tmp_path, capsys, monkeypatch):
+    def refused(*_):
+        raise ParameterError('orders are\n' + ', '.join(map(str, range(500))) + ': give fewer')
+    monkeypatch.setattr(loop_run, 'run', refused)
+    assert close_loop.main(['rig.npz', '--declared', str(shipped('machine.yaml')), '--quiet',
+                            '--output', str(tmp_path / 'report')]) == 2
+    line, end = capsys.readouterr().err.split('\n')
+    assert line.startswith('close_loop: orders are 0, 1, ')
+    assert line.endswith('499: give fewer')
+    assert not end
 
 
 def test_command_runs_in_any_thread_and_gives_sigterm_back(tmp_path, capsys):

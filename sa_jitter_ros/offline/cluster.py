@@ -16,7 +16,7 @@ from concurrent.futures import CancelledError
 import logging
 from typing import Any, TypeVar
 
-from sa_jitter_ros.errors import one_line, ParameterError, SaJitterError
+from sa_jitter_ros.errors import one_line, ParameterError, quoted, SaJitterError
 from sa_jitter_ros.offline.processes import attempt, Failure
 
 Job = TypeVar('Job')
@@ -81,7 +81,7 @@ def _connected(connect: Callable[..., Any], address: str) -> Any:
     except Exception as error:  # of a wrong address, or of what answers there, of any type
         raise ParameterError(f'--scheduler {address}: no answer of a Dask scheduler within '
                              f'{ANSWER:g} s: check host and port, and that dask scheduler runs '
-                             f'({one_line(error)})') from None
+                             f'({quoted(error)})') from None
 
 
 async def _try(connect: Callable[..., Any], address: str) -> None:

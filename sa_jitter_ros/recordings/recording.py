@@ -19,14 +19,14 @@ from typing import Protocol
 
 import numpy as np
 from sa_jitter_ros.arrays import Array, FloatArray
-from sa_jitter_ros.errors import one_line, RecordingError
+from sa_jitter_ros.errors import quoted, RecordingError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.samples import SampleBlock, unresolved_times
 
-
 _MAX_CHANNELS = 4096
+_LONGEST = 500  # characters of an error that may quote a recording
 MAX_PULSES = 50_000_000
 
 
@@ -318,9 +318,9 @@ def recording_errors(path: str | Path) -> Iterator[None]:
     except RecordingError as error:
         if str(error).startswith(place):
             raise
-        raise RecordingError(f'{place}{one_line(error)}') from error
+        raise RecordingError(f'{place}{quoted(error, _LONGEST)}') from error
     except Exception as error:
-        reason = one_line(error) or 'no reason given'
+        reason = quoted(error, _LONGEST) or 'no reason given'
         raise RecordingError(
             f'{place}cannot be read ({type(error).__name__}: {reason})') from error
 
