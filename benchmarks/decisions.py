@@ -226,7 +226,7 @@ def markdown(found: Sequence[Result], *, by: str = 'class', only: set[str] | Non
                  for outcome in OUTCOMES]
         lines.append(f'| {title or "all"} | {", ".join(str(len(half)) for half in halves)} | '
                      + ' | '.join(cells) + ' |')
-    return '\n'.join([*lines, '', _probabilities(found)])
+    return '\n'.join([*lines, '', _calibration(found)])
 
 
 def _title(row: Result, by: str) -> str:
@@ -234,7 +234,7 @@ def _title(row: Result, by: str) -> str:
     return row[by] or 'refused'
 
 
-def _probabilities(found: Sequence[Result]) -> str:
+def _calibration(found: Sequence[Result]) -> str:
     """Return whether the p values of right reports are even, and how often effects are there."""
     lines = []
     for verdict in ('none', 'traced'):
@@ -247,16 +247,16 @@ def _probabilities(found: Sequence[Result]) -> str:
                          f'{", ".join(map(str, _LEVELS))}; Kolmogorov-Smirnov p {even:.2g}')
     pairs = [pair for row in found for pair in row.get('stated') or ()]
     if pairs:
-        stated_, there = np.array(pairs, float).T
+        value, there = np.array(pairs, float).T
         lines += [f'{there.size} probabilities of effects, Brier score '
-                  f'{np.mean((stated_ - there) ** 2):.2g} '
+                  f'{np.mean((value - there) ** 2):.2g} '
                   f'({np.mean(there) * (1.0 - np.mean(there)):.2g} by their share alone)', '',
                   '| stated | effects | mean stated | there |', '|---|---|---|---|']
         for low, high in pairwise(_BINS):
-            here = (stated_ >= low) & (stated_ < high)
+            here = (value >= low) & (value < high)
             if here.any():
                 lines.append(f'| {low:g} to {min(high, 1.0):g} | {here.sum()} | '
-                             f'{stated_[here].mean():.2g} | {there[here].mean():.2g} |')
+                             f'{value[here].mean():.2g} | {there[here].mean():.2g} |')
     return '\n'.join(lines)
 
 

@@ -29,7 +29,6 @@ from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import (PulseErrorFit, PulseErrorProblem,
                                                      real_parts)
 
-
 # Relative step of a precision, in the derivative of a covariance.
 _STEP = 1e-3
 # The negative frequency of a line, farther from an order than the line, makes noise in phase with

@@ -37,7 +37,6 @@ from sa_jitter_ros.averaging.noise import row_medians
 from scipy import fft
 from scipy.special import chndtrix, erf
 
-
 # Cycles from which on the spectrum near zero is used, at least so many lines of it, and their
 # share of the cycles.
 _MANY, _LINES, _SHARE = 32, 4, 0.1

@@ -29,7 +29,6 @@ from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses, PulseValidator
 
-
 AVERAGING = ('block', 'sliding', 'exponential')
 
 

@@ -288,7 +288,7 @@ def _aligned(raw: Average, cycles: list[CycleSamples], settings: AverageSettings
     grid = grids.of(cycles, settings.interpolation, raw.cycle_numbers)[1]
     errors = recovery.expected / np.mean(raw.periods)
     first = known[1] if known else other_lines(
-        grid, 0.0 * errors, raw.orders, settings.cycle_length)
+        grid, np.zeros_like(errors), raw.orders, settings.cycle_length)
     more = first[:0] if known else other_lines(
         grid, errors, np.append(raw.orders, first), settings.cycle_length)
     return _Aligned(recovery, refitted, (first, more), _average_again(

@@ -37,7 +37,6 @@ from sa_jitter_ros.pulses.resampling import (
     impulse_response, interpolate_along, interpolate_between, margin)
 from scipy.fft import next_fast_len
 
-
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
 _COPIED = 1 << 15  # numbers from which on cycles of several arrays are not put together

@@ -21,7 +21,6 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery
 
-
 #: Error of a pulse, over a trigger cycle, up to which it is searched for.
 REACH = 0.15
 _FEWEST = 8  # trigger cycles, of which most have to be right

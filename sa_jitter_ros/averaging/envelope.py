@@ -37,7 +37,6 @@ from sa_jitter_ros.pulses.angle_law import angle_law
 from sa_jitter_ros.pulses.resampling import periodic
 from scipy.fft import fft, ifft, next_fast_len
 
-
 #: Slip: how far from a bearing order the line that stands out may be, relative to it.
 SLIP = 0.02
 _BAND = 0.15  # of the lines around a bearing order that show the noise, relative to it

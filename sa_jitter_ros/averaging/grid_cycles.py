@@ -26,7 +26,6 @@ from sa_jitter_ros.averaging.spectral_lines import line_limit, peaks, spectrum
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import rfft
 
-
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32
 # The part of the sampling rate in which lines and orders are searched.

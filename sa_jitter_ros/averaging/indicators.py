@@ -75,7 +75,6 @@ from sa_jitter_ros.averaging.jackknife import jackknife_variance, PARTS, Wavefor
 from sa_jitter_ros.errors import ParameterError, SignalError
 from scipy.fft import ifft, next_fast_len
 
-
 INDICATORS: tuple[str, ...] = (
     'rms', 'peak', 'crest_factor', 'kurtosis', 'fm0', 'fm4', 'm6a', 'm8a', 'na4',
     'energy_ratio', 'sideband_ratio', 'sideband_level_factor', 'na4_star', 'nb4', 'm6a_star',

@@ -26,7 +26,6 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.pulses.resampling import gain_below_nyquist
 
-
 #: The least gain by which an amplitude is divided.
 LEAST_GAIN = 0.5
 

@@ -26,7 +26,6 @@ import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.running_mean import BlockMean
 
-
 #: Parts of the cycles of an average.
 PARTS = 3
 

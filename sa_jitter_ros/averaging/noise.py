@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import ComplexArray, FloatArray
 
-
 # The orders that leak contain leakage of each other: iterations until this is negligible.
 _PASSES = 6
 _ORTHOGONAL = 1e-12  # leakage that is rounding: of whole orders over whole fundamental cycles

@@ -25,7 +25,6 @@ from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.synchronous_orders import significance
 
-
 # Cycles from which on lines are told from changes of the orders, and most lines.
 _LEAST_CYCLES, _MOST = 8, 16
 # Turns of a line against an order in all cycles from which on it is no slow change of the order.

@@ -41,7 +41,6 @@ from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_chain import shortest_path, Tridiagonal
 from scipy.linalg import lapack, qr
 
-
 _NODE_ERROR = 1e-4
 _MOST_NODES = 20
 _ITERATIONS = 25
@@ -314,7 +313,7 @@ class PulseErrorProblem:
             converged = np.all(moved < _CONVERGED * np.abs(amplitudes[self.significant]))
             if converged and np.max(np.abs(step)) < 0.02 * np.sqrt(np.min(covariance[0])):
                 break
-        evidence = log_likelihood(information, 0.0 * pull, std) + 0.5 * (
+        evidence = log_likelihood(information, np.zeros_like(pull), std) + 0.5 * (
             self._misfit_without_errors(weight) - np.sum(residual**2)
             - np.sum(errors**2) / std**2
             + np.log(information.times(np.ones(len(pull))).sum()))

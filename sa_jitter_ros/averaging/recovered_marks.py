@@ -27,7 +27,6 @@ from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 
-
 _FEWEST = 2  # pulses of each mark in an average
 _MEMORY = 50.0  # averages
 _DECIDES = 0.5  # share of the errors that are taken, with which the vibration decides

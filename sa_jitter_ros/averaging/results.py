@@ -23,7 +23,6 @@ from sa_jitter_ros.averaging.envelope import Envelope
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.shaft_indicators import best_of, ShaftIndicators
 
-
 AMPLITUDE_FIELDS = (
     'order', 'raw_amplitude', 'raw_phase', 'corrected_amplitude', 'corrected_phase',
     'attenuation', 'attenuation_standard_error', 'noise_standard_deviation',

@@ -39,7 +39,6 @@ from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, Pa
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law, LINEAR_LAW
 
-
 # Cycles from which on it is not known how many come.
 _ALL_CYCLES = 1 << 40
 #: Samples times channels that are averaged together.

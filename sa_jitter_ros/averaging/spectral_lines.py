@@ -19,8 +19,6 @@ from sa_jitter_ros.averaging.noise import row_medians
 from scipy.fft import rfft
 from scipy.special import gammainccinv
 
-IntArray = NDArray[np.intp]
-
 #: A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor.
 FALSE = 1e-3
 _MARGIN = 1.25
@@ -69,7 +67,7 @@ def line_limit(channels: int, bins: float) -> float:
     return _MARGIN * float(gammainccinv(channels, FALSE / bins))
 
 
-def peaks(ratio: FloatArray, limit: float) -> tuple[IntArray, FloatArray]:
+def peaks(ratio: FloatArray, limit: float) -> tuple[NDArray[np.intp], FloatArray]:
     """Return the bins where a `ratio` (bin,) has peaks above a limit, and their tops between."""
     inside = ratio[1:-1]
     place = 1 + np.flatnonzero((inside > ratio[:-2]) & (inside >= ratio[2:]) & (inside > limit))

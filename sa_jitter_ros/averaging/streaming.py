@@ -36,7 +36,6 @@ from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.samples import SampleBlock
 
-
 #: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here; `skipped` are the
 #: discarded ones since the pulse before, 0 if their number is not known. `epoch` is how often time
 #: ran back before; `elapsed` the time (s) since the first pulse, without the steps back. `mark` is

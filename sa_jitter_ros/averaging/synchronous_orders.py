@@ -32,7 +32,6 @@ from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import CompressedCycles
 from scipy.ndimage import median_filter
 
-
 # Probability that noise alone passes as a synchronous order in any of the orders and channels.
 _FALSE_ALARM = 1e-3
 # Share of the level of that test which an order reaches in a search if it passes the test: the

@@ -25,7 +25,6 @@ from sa_jitter_ros.offline.files import finished_together, Signals, write_averag
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import MachineFile
 
-
 Results = Sequence[Mapping[str, AverageMessage]]
 _FIELDS = ('raw_amplitude', 'corrected_amplitude', 'noise_standard_deviation', 'attenuation')
 _PREDICTED = [1, 4, 6]  # mean, 5 % and 95 % quantile

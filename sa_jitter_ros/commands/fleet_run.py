@@ -23,7 +23,6 @@ from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, remove_unfin
 from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
 from sa_jitter_ros.offline.processes import Failure
 
-
 Work = TypeVar('Work', bound=RecordingJob)
 Row = TypeVar('Row', bound=RecordingRow)
 STOPPED = 'stopped; what was finished stays, the same command goes on from there'

@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import unit_nodes
 
-
 #: Of what wanders or modulates, as a fraction of the trigger rate: below half of it by definition.
 #: It may be slower than any record, as load and temperature are.
 SLOW_BAND = (0.0, 0.4)

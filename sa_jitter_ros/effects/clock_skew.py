@@ -22,7 +22,6 @@ from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-
 #: Clocks, and ratios, are seldom wrong by more.
 USUAL_SKEW = 5e-3
 

@@ -23,7 +23,6 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import ONE_SIDED
 from scipy.optimize import minimize
 
-
 _LEAST = 0.1  # of the noise: what a line changes by itself at least
 _RANGE = 25.0  # of logarithms of a power
 

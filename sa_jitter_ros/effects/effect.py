@@ -31,7 +31,6 @@ from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-
 #: Chance of what is beyond a limit, and of what is taken for decided and is not.
 RARE = 0.05
 #: What a normal variable exceeds so seldom, in standard deviations.

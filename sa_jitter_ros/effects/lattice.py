@@ -19,7 +19,6 @@ from sa_jitter_ros.pulses.clock_grid import find_grid
 from scipy import special
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-
 #: Relative difference of rates below which two clocks count as one.
 SAME_RATE = 0.01
 #: Of a tick: what errors that a clock makes may be wrong by, and what none is seen below.

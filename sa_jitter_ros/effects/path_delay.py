@@ -28,7 +28,6 @@ from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-
 #: Filters and converters seldom delay by more (s).
 USUAL_DELAY = 5e-3
 #: Relative spread of speeds below which nothing follows the speed, and a delay is a phase.

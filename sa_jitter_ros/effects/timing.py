@@ -26,7 +26,6 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-
 PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
 #: Logarithms of a power, in unit^2, below which there is as good as none, and that none exceeds.
 FAINT, LARGE = -12.0, 20.0

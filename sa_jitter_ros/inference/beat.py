@@ -27,7 +27,6 @@ from sa_jitter_ros.pulses.resampling import interpolator_gain
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
-
 METHODS = ('linear', 'cubic', 'spline')
 _KNOWN = 0.03  # error of the shape
 _HARMONICS = 4  # of the beat

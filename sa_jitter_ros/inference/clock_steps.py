@@ -28,7 +28,6 @@ from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-
 # Cycles on either side whose mean phasors are compared, most and fewest, and of a sudden change.
 _BESIDE, _FEWEST, _SUDDEN = 24, 8, 4
 # Standard deviations of the contrasts of a record from which on one is a step: drifts make 5.

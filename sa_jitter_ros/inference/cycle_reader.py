@@ -21,7 +21,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import margin
 
-
 #: Samples on either side of a cycle, for interpolation and corrected pulses.
 MARGIN = 40
 

@@ -42,7 +42,6 @@ from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import COARSEST, SampledDistribution
 from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES
 
-
 Distribution = AmplitudeDistribution | SampledDistribution
 
 #: Relative uncertainty of an amplitude that comes from resampling.

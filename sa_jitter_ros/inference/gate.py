@@ -23,7 +23,6 @@ import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import Finding
 
-
 #: Standard errors of a paired difference from which on it is one.
 CERTAIN = 2.0
 

@@ -32,7 +32,6 @@ from sa_jitter_ros.prediction.influence import AveragePulses, known_errors, with
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-
 #: Of its order's strongest channel, from which on a line is worth comparing.
 STRONG = 0.2
 _COHERENT = 0.9

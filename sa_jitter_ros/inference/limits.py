@@ -39,7 +39,6 @@ from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
 from scipy import special
 
-
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
 
 

@@ -30,7 +30,6 @@ from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
 from scipy import special
 
-
 LINES = 'lines'
 _TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
 _LOSS = 0.14  # rad by which a line that turns in each cycle loses 1 % of its average

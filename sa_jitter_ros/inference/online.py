@@ -26,7 +26,6 @@ from sa_jitter_ros.inference.residual import Residual, residual
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.special import ndtr
 
-
 _NOISE = 0.1  # of its amplitude that a line may scatter by
 _MOST_PULSES = 1000  # per revolution
 

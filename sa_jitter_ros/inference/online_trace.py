@@ -40,7 +40,6 @@ from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-
 _DECISIVE = 'close_loop on a recording, which contains the signals within trigger cycles,'
 _REASON = 'the topics do not contain {}: run close_loop on a recording'
 ONLY_OFF_LINE = {

@@ -21,7 +21,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.recordings.recording import Recording
 
-
 #: Of the declared speed, relative.
 SPEED_TOLERANCE = 0.1
 _SPEEDS = 0.05  # share of the cycles that are faster than the speeds of a run-up, and slower

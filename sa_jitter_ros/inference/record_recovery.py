@@ -34,7 +34,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from scipy import special
 
-
 _EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch
 #: Largest standard error of resolved pulse errors, in parts of their size.

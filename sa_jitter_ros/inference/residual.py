@@ -23,7 +23,6 @@ import numpy as np
 from sa_jitter_ros.arrays import Array
 from scipy import special
 
-
 #: Accuracy of a predicted attenuation: smaller residuals do not change the verdict.
 ACCURACY = 3e-3
 #: Accuracy of the difference of two predictions for the same lines at the same speed.

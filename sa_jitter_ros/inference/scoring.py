@@ -35,7 +35,6 @@ from sa_jitter_ros.prediction.amplitudes import component_gain
 from sa_jitter_ros.prediction.influence import AveragePulses
 from scipy import special
 
-
 _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 

@@ -54,7 +54,6 @@ from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _BESIDE = 12  # ordinates on either side of a sinusoid, of which the noise is told

@@ -27,7 +27,6 @@ from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, Timi
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import EDGE, through
 
-
 _DECLARED, _SCALED, _TICKS = 'declared', 'scaled', 'ticks'
 #: Draws of what is there by chance, and their seed.
 DRAWS, SEED = 400, 11

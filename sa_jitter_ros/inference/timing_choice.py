@@ -38,7 +38,6 @@ from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
 
-
 #: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
 RIPPLE = 'ripple'
 #: Sidebands that turn all lines by one time: no effect, but a source that moves may look like it.

@@ -28,7 +28,6 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import recovered, recovered_shapes
 from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
 
-
 _NEXT = 1
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
 ALIASES = np.array([0, _NEXT, -_NEXT])

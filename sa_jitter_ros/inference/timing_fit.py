@@ -29,7 +29,6 @@ from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
 
-
 #: What is always there: the motion of the shaft, the declared jitter, the noise of the recovery.
 SHAFT, JITTER, NOISE = 'shaft', 'jitter_scale', 'noise'
 # Frequencies at which the spectrum of the motion is free.

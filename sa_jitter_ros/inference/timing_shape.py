@@ -28,7 +28,6 @@ from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from scipy.fft import irfft, rfft
 from scipy.special import ndtr
 
-
 EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see
 _STRAY = 0.02  # share of errors that may be anything

@@ -25,7 +25,6 @@ from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.number_text import percent_text
 from scipy import special
 
-
 #: Relative scatter of an amplitude from average to average that steady machines were measured to
 #: have and that no effect describes (docs/measured_cases.md).
 STEADY = 0.02

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from scipy.sparse import _sparsetools
 
-
 _PIECE = 1 << 11  # positions whose weights are in the cache at once
 
 

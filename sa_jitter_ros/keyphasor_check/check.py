@@ -45,7 +45,6 @@ from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-
 _MOST_MARKS, _MOST_ENCODER = 72, 4096  # of any number, and of usual ones
 _SYMMETRY = 1.5  # log probability that a pattern repeats in a revolution
 _DECLARED = math.log(300.0)  # what the statement of a recording says for a number of marks

@@ -15,7 +15,6 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.effects.lattice import Clock, NO_CLOCK
 from sa_jitter_ros.pulses.clock_grid import find_grid
 
-
 _MOST = 4000
 _FEWEST = 12
 _DECIMALS = 1e6  # Hz; a power of ten from there on may be a decimal

@@ -22,7 +22,6 @@ from sa_jitter_ros.keyphasor_check.lines import ToothLines
 from sa_jitter_ros.keyphasor_check.result import Warn
 from sa_jitter_ros.machine import Machine
 
-
 _NEAR = 1.5  # bins from the place of a part at which a line is still its own
 _MISCOUNTED = (-3, -2, -1, 1, 2, 3)  # teeth
 # Lines, and sum of the logarithms of their sizes, by which other teeth must fit better.

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 
-
 _FEWEST = 24
 _LOWEST = 0.02  # cycles a pulse, below which the motion has any spectrum
 _MOST = 65_536

@@ -29,7 +29,6 @@ from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len, rfft
 
-
 _MOST_VALUES = 3_000_000
 _MOST_POINTS = 600_000
 # Times the median of the spectrum around: a line; and one that noise makes in 5e-5 of places.

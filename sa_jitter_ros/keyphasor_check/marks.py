@@ -25,7 +25,6 @@ from sa_jitter_ros.keyphasor_check.teeth import joined_parts, nearest_pulses, Nu
 from sa_jitter_ros.keyphasor_check.wheel import Marking, pattern_of
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 
-
 _ROUNDS = 2
 _OUTLIER = 8.0  # robust standard deviations
 _LEAST = 0.02  # teeth that a stray stands beside its tooth at least

@@ -27,7 +27,6 @@ from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-
 _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000
 _MOST_PULSES = 4000

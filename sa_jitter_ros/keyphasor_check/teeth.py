@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from scipy.ndimage import rank_filter, uniform_filter1d
 
-
 #: Pulses from which on a target can be numbered.
 FEWEST = 6
 # Pulses around one from which its place follows: few follow a changing speed, many see through

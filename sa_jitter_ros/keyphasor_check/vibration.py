@@ -29,7 +29,6 @@ from sa_jitter_ros.keyphasor_check.jitter import Jitter
 from sa_jitter_ros.keyphasor_check.result import Checked
 from scipy import special
 
-
 _FEWEST_AVERAGES = 3
 _FEWEST_SPEEDS = 6
 _SPEED_RANGE = 0.02  # relative, below which phases say nothing of a delay

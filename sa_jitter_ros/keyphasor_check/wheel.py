@@ -26,7 +26,6 @@ from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from sa_jitter_ros.keyphasor_check.teeth import NumberedPulses
 from sa_jitter_ros.pulses.target import index_of
 
-
 _MOST_TEETH = 1200
 _FEWEST_REVOLUTIONS = 4
 _MOST_PULSES = 60_000

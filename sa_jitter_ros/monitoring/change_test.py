@@ -31,7 +31,6 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.evidence import below, ChangeEvidence, Kept, SIZES, threshold
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 
-
 #: Values of a baseline from which on new ones can be tested.
 LEAST_LEARNED = 8
 # Correlation counts from so many standard errors on, and up to the largest. Scores show it so many

@@ -30,7 +30,6 @@ import numpy as np
 from sa_jitter_ros.arrays import Array, BoolArray, FloatArray
 from scipy.special import ndtr
 
-
 #: Sizes of the changes that are looked for, in standard deviations of a score. Between two of them
 #: a change is found with a third more scores than at the best size. Smaller changes take so many
 #: scores that no baseline shows what the machine does over that time. The last two only tell when

@@ -30,7 +30,6 @@ from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingState
 from sa_jitter_ros.monitoring.quantities import KINDS, Layout, monitored, MonitoredAverage
 
-
 # Averages that wait for arrays that are on their way; older ones do without.
 _WAITING = 4
 # Averages without indicators after which a shaft is taken to have none.

@@ -31,7 +31,6 @@ from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.parameters import fixed, Parameter, Values
 from scipy import special
 
-
 YEAR = 365.25 * 86400.0  # s
 # Bins: the machine passes through more of them in a run-up than it stays in.
 _MOST_BINS = 64

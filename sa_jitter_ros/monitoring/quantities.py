@@ -29,7 +29,6 @@ from sa_jitter_ros.averaging.results import (
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.machine import Machine
 
-
 #: Topics of a shaft whose arrays make one average, by the names of their arrays.
 KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',
          'envelope_amplitude')

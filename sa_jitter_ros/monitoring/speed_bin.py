@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.monitoring.evidence import Kept, SIZES
 
-
 # No value counts more than one so many standard deviations off, as a score and in the baseline: a
 # single wild average is no change.
 _LARGEST = 4.0

@@ -28,7 +28,6 @@ from sa_jitter_ros.parameters import fixed, Parameter, TACH_TYPE, Values
 from sa_jitter_ros.samples import SampleBlock
 from std_msgs.msg import Float64MultiArray
 
-
 TRANSPORT_BYTES_PER_SECOND = 100e6
 MAX_LAG = 0.5  # s; a stream that lags more continues from now instead of catching up
 PROGRESS_PERIOD = 5.0  # s between log lines on progress

@@ -30,7 +30,6 @@ from sa_jitter_ros.recordings.fields import fields_of
 from sa_jitter_ros.recordings.reading import READ_PARAMETERS
 from sa_jitter_ros.samples import SampleBlock
 
-
 PARAMETERS = (
     fixed('recording', '', 'file or rosbag2 folder to play'),
     Parameter('loop', False, 'start again at the end; times and indices continue'),

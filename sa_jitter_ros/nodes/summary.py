@@ -27,7 +27,6 @@ from sa_jitter_ros.number_text import HALF_95, measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
 
-
 _ORDERS = 10  # the strongest ones
 _STATUS = dict(zip(('', *LEVELS), (
     DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)))

@@ -37,7 +37,6 @@ from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings.channel_units import channels_of
 from std_msgs.msg import Float64, Float64MultiArray
 
-
 _LATEST = 6  # averages that tell whether orders hold lines
 _SUMMARY_PAUSE = 1.0  # s between summaries of averages that come once a trigger cycle
 MOST_SOURCES = 100  # names of keyphasors that are remembered

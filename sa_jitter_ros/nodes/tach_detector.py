@@ -30,7 +30,6 @@ from sa_jitter_ros.pulses.detection import detector_of
 from sa_jitter_ros.pulses.detector_parameters import DECISIVE, DETECTOR_PARAMETERS
 from sensor_msgs.msg import JointState
 
-
 # Once the state levels are learnt, the detector finds all pulses of the window. Subscribers
 # queue 200 messages and may be busy with an average: the pulses are published in portions.
 BURST = 10

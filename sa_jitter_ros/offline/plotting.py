@@ -19,7 +19,6 @@ import numpy as np
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.series import ShaftSeries
 
-
 RAW, CORRECTED, MEASURED, MARK = 'tab:red', 'tab:blue', 'black', 'tab:orange'
 MOST_CHANNELS = 3
 _LEVELS = {'warn': 'darkorange', 'alarm': 'red'}

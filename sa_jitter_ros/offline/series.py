@@ -24,7 +24,6 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.results import AverageHeader, AverageMessage
 from sa_jitter_ros.pulses.resampling import periodic
 
-
 # Names of the arrays where they are not those of the topics, and of the header.
 _NAMES = {'synchronous_average': 'waveform'}
 _HEADER = {'mean_trigger_speed': 'trigger_speed'}

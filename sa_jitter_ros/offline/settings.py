@@ -32,7 +32,6 @@ from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
 
-
 AVERAGER, DETECTOR = 'synchronous_averager', 'tach_detector'
 _PARAMETERS = {item.name: item for item in PARAMETERS}
 _SHAFTS = _PARAMETERS['shafts']

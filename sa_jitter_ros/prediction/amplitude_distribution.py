@@ -30,7 +30,6 @@ from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.prediction.sampled_distribution import require_probabilities
 from scipy.special import ndtr, ndtri
 
-
 _REACH = 8.5  # standard deviations; 2e-17 of a normal distribution lies outside
 _NODES, _MOST_STEEP = 48, 8  # 1e-9 of a distribution function; times as many where it is steep
 _HERMITE, _HERMITE_WEIGHTS = np.polynomial.hermite_e.hermegauss(32)  # 1e-5 of Var|X|, kinks apart

@@ -45,7 +45,6 @@ from sa_jitter_ros.prediction.sampled_distribution import (
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
 from sa_jitter_ros.pulses.angle_law import LINEAR_LAW
 
-
 # Cycles up to which the distribution is sampled under effects. Of independent pulse errors, as
 # many as leave the curved one 0.005 off in its CDF: more under a bent law, as many again for each
 # unit of a table's squared skewness, and more where few values of a table make few of an average.

@@ -37,7 +37,6 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.pulses.angle_law import Covariance, LINEAR, PulseWeights
 
-
 _RANK = 1e-9  # variance of what is left out of drawn processes, over the largest component's
 
 

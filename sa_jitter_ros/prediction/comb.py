@@ -37,7 +37,6 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ParameterError
 
-
 # Closer than this, an order counts as synchronous and a number of cycles as whole.
 _SAME = 1e-9
 # A component of which an order amplitude keeps a thousandth changes no reading, and a tenth more

@@ -25,7 +25,6 @@ from sa_jitter_ros.prediction.distributions import Empirical
 from sa_jitter_ros.prediction.moments import (
     correlation_length, cycle_moments, CycleMoments, require_cycles, require_orders)
 
-
 _REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
 # Of tables, whose values do not smear what wide errors do, and their spreads in cycles.

@@ -34,7 +34,6 @@ from sa_jitter_ros.prediction.moments import cycle_moments, require_orders
 from sa_jitter_ros.prediction.prediction import predict
 from scipy.optimize import brentq
 
-
 #: Distributions of pulse errors that are as wide as the keyphasor rate makes them.
 RATE_DISTRIBUTIONS = ('uniform', 'normal', 'triangular')
 

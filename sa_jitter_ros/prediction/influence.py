@@ -31,7 +31,6 @@ from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 
-
 _SMOOTH = 25  # pulses over which a speed is taken
 
 

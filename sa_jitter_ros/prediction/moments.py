@@ -33,7 +33,6 @@ from sa_jitter_ros.prediction.angle_error import (
     angle_spread, AngleErrorProcess, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import is_number
 
-
 NODES = 64
 _NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly
 # Cycles of the order from which on a rule over the square is too coarse; panels of the distance.

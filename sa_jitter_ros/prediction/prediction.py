@@ -30,7 +30,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
 
-
 QUANTILES = (0.05, 0.50, 0.95)
 
 

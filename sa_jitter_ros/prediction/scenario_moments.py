@@ -19,7 +19,6 @@ from sa_jitter_ros.prediction.angle_error import (
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
 
-
 _COARSE, _FINE = unit_nodes(16), unit_nodes(32)
 _CLEAR = 0.05  # mean phasor down to which the coarse rule is exact to 1e-6
 _STEEP = 0.5  # fundamental cycles within a cycle: there a pulse is missing

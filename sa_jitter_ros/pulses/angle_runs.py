@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 
-
 _BLOCK = 16  # steps from which those of the next block are judged
 _LONGEST = 4  # samples of a glitch
 _DRIFT = 3.0  # times what is usual, by which the samples after a glitch may be off

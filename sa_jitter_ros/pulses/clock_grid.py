@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 
-
 _FEWEST = 6  # intervals
 _DIFFERENT = 0.5  # most of the intervals that differ from all others
 LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick

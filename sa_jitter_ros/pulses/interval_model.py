@@ -31,7 +31,6 @@ from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 from sa_jitter_ros.pulses.pulse_chain import robust_square
 from sa_jitter_ros.pulses.pulse_paths import LevelPrediction, OTHER, REACH
 
-
 _PLACE = np.arange(1, REACH + 1) - 0.5 * (REACH + 1)  # of the latest interval last
 _LINE = 1.0 / REACH + _PLACE * 0.5 * (REACH + 1) / float(np.sum(_PLACE**2))
 _WEIGHTS = ((1.0,), (-1.0, 2.0), (1.0 / REACH,) * REACH, tuple(_LINE.tolist()))

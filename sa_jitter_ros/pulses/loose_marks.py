@@ -25,7 +25,6 @@ from sa_jitter_ros.pulses.clock_grid import clock_tick
 from sa_jitter_ros.pulses.target import EvenTarget, Target
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
-
 _MARKS = 4  # of more, one that is loose spoils few trigger cycles that the judge does not drop
 # Revolutions fitted at once, odd so that most pulses are on one side; how many such fits count.
 _TURNS, _FEWEST, _LATEST = 11, 4, 16

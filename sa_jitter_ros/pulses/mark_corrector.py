@@ -26,7 +26,6 @@ from sa_jitter_ros.pulses.target_geometry import (
     combined, MarkOffsets, matches, measured_geometry, turned, turned_by)
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
-
 _LEARNT, _LONGEST = 100, 3.0  # revolutions and seconds
 _TRIED = (8, 32, _LEARNT)  # revolutions after which the pattern is looked for
 _RENEWED, _MEMORY = 50, 1000.0  # revolutions

@@ -16,7 +16,6 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 
-
 _FEWEST = 2  # intervals of a mark
 # How much more the means of the marks have to scatter than the intervals of one mark explain.
 _SIGNIFICANT = 4.0

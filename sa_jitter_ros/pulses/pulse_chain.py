@@ -23,7 +23,6 @@ from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.pulses.pulse_paths import Path, PathRules, Step
 from scipy.ndimage import median_filter
 
-
 #: cost of a stray among the first pulses of one mark, and of marks that may be uneven
 STRAY_OF_ONE, STRAY_OF_MARKS = 8.0, 10.0
 _MOST_PATHS = 16

@@ -29,7 +29,6 @@ from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
 
-
 _TURN = 2.0 * math.pi
 _BEFORE, _AFTER = 3, 3  # samples around a crossing
 _KEPT = 32  # samples before the next crossing

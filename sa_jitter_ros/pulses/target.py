@@ -27,7 +27,6 @@ from sa_jitter_ros.pulses.pulse_chain import (
     Chain, find_chain, STRAY_OF_MARKS, STRAY_OF_ONE, unsteadiness)
 from scipy.ndimage import median_filter
 
-
 # Pulses from which the interval is learnt: those of this time (s), in these limits.
 _LEARNING_TIME, _FEWEST, _MOST = 1.0, 4, 12
 # How often the pulses double after which noise is tried again, 2 of them at first; the most that

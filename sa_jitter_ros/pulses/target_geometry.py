@@ -23,7 +23,6 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray, IntArray
 from scipy.ndimage import uniform_filter1d
 
-
 _FEWEST = 4
 _ROUNDS = 4  # which missing pulses and teeth need
 _CLIPPED = 5.0  # robust standard deviations: displaced pulses tell nothing of their mark

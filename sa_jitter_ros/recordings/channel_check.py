@@ -19,7 +19,6 @@ from sa_jitter_ros.recordings.channel_map import with_channels
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from sa_jitter_ros.recordings.recording import Recording
 
-
 _MOST_LOST = 0.5  # of the samples
 _AT_END = 0.02  # of the samples, at the very same largest or smallest value
 _FEWEST = 16

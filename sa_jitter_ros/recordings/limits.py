@@ -29,7 +29,6 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError, SaJitterError
 
-
 MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
 MAX_VALUES = 200_000_000  # samples of all channels that are read into memory
 _MAX_TIME = 1e15  # s, as 30 million years

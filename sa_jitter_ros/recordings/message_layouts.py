@@ -26,7 +26,6 @@ from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.samples import SampleBlock
 
-
 FLOAT64 = 'std_msgs/Float64MultiArray'
 FLOAT32 = 'std_msgs/Float32MultiArray'
 IMU = 'sensor_msgs/Imu'

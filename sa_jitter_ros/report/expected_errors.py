@@ -23,7 +23,6 @@ from sa_jitter_ros.prediction.influence import (
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, with_effects
 from scipy.linalg import toeplitz
 
-
 _MOST_LAGS = 25
 _SMALL = 1e-5  # s; sets the step at which the characteristic function gives a variance
 _DRAWS, _SEED = 20_000, 3

@@ -29,7 +29,6 @@ from sa_jitter_ros.number_text import HALF_95, order_text
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import AFTER, arrange, BEFORE, MEASURED, panels, with_effects
 
-
 _FEWEST_CYCLES = 3
 _MOST_PANELS = 3
 _POINTS = 200

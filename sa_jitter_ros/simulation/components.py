@@ -18,7 +18,6 @@ from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.random_streams import RandomStream
 
-
 _MAX_WIDTH = 0.15  # revolutions; beyond it more than two neighbouring bursts overlap
 
 

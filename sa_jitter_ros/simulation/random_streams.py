@@ -23,7 +23,6 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from scipy.signal import lfilter
 
-
 CHUNK = 1024
 _LINES = 48  # sinusoids of a random function
 _NEGLIGIBLE = 1e-17  # correlation below the resolution of a float64

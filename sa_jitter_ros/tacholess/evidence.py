@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from scipy.special import gammaincc
 
-
 _FOREIGN = 0.05  # of all bins hold a peak of something else
 _ABSENT = 0.3  # of the time a line of the machine is not to be seen
 _HOPS = 4  # of frames in the length of one

@@ -22,7 +22,6 @@ from sa_jitter_ros.tacholess.found import among, FoundPulses
 from sa_jitter_ros.tacholess.phase import Phase, phase_of, UNKNOWN
 from sa_jitter_ros.tacholess.rough import PRESENT, Rough, rough_speed
 
-
 _MOST_ORDERS = 8  # of which the phase is looked at
 _BAND = 0.45  # of the sampling rate, up to which lines are used
 _MOST_CELLS = 20_000

@@ -25,7 +25,6 @@ from sa_jitter_ros.parameters import numbers
 from sa_jitter_ros.tacholess.phase import Phase
 from scipy.sparse import csr_matrix
 
-
 _MOST_PULSES = 6000  # of which the covariance is given at once: 300 MB
 _WINDOWS = 8  # averages of a recording for which their attenuation is found
 _DRAWS = 400

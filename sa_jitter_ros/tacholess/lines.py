@@ -19,7 +19,6 @@ from sa_jitter_ros.arrays import Array, ComplexArray, FloatArray
 from sa_jitter_ros.tacholess.path import best_path
 from scipy.ndimage import uniform_filter1d
 
-
 _PIECE = 1 << 19  # samples of a channel at a time, so that memory stays small
 _CAP = 4.0  # amplitude over noise beyond which a line has no more to say of the first phase
 _TURN = 0.6  # of the strongest order, between cells, within which the first phase is sought

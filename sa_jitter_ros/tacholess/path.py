@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-
 RULED_OUT = -20.0  # nats, more than a frame of any comb loses
 # A step of the path up to this share of the largest one costs so many nats.
 _COSTS = ((1.0 / 16.0, 0.0), (1.0 / 4.0, 0.5), (1.0, 2.0))

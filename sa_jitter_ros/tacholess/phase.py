@@ -22,7 +22,6 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.sparse import csr_matrix
 
-
 UNKNOWN = ('the lines are too weak, change too fast, or do not turn together, to follow their '
            'phase without losing turns: give other orders or another sensor')
 _WIDTHS = (8, 32, 128)  # cells over which the own phase of a line is constant, at first and later

@@ -20,7 +20,6 @@ from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.tacholess.evidence import comb, CombSpectra, spectra_of
 from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
 
-
 _WINDOWS = (24.0, 12.0, 6.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
 _STEP = 0.35  # of a bin of the highest order, between speeds

@@ -29,7 +29,6 @@ from sa_jitter_ros.arrays import FloatArray
 from scipy.linalg import cho_solve_banded, cholesky_banded, LinAlgError
 from scipy.optimize import minimize
 
-
 _SHAFT, _OWN = 3, 2  # states of the shaft, and of a line
 MEMORY = 100.0  # cells that the rate of the phase of a line lasts: about a resonance
 _SHARED = 2.0  # of what lines turn by themselves, all turn: resonances have one direction
