@@ -23,6 +23,7 @@ import ast
 from collections import Counter
 from collections.abc import Iterator, Sequence
 import compileall
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 import json
@@ -38,12 +39,12 @@ from decision_machines import BROKEN, INDEPENDENT, LOOP, OWN, rows
 from decisions import published
 
 NOTICED = Path(__file__).with_suffix('.json')
-_ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 _PACKAGE = 'sa_jitter_ros'
 _ROOMS = 'inference', 'effects', 'keyphasor_check', 'pulses'
 #: The tests of folders on whose numbers no row is asked.
 _TESTS = {'keyphasor_check': 'test_keyphasor_*.py', 'pulses': 'test_pulses_*.py'}
-_MARKS = 'not (build or campaign or processes or style)'
+MARKS = 'not (build or campaign or processes or style)'
 _FACTOR = 10
 _LONGEST = 600.0  # s, of a row: a search that does not end is noticed
 _OF_A_ROW = 4  # numbers, in a sample
@@ -69,7 +70,7 @@ class Number:
     def asked(self) -> list[str]:
         """Return what may notice it: the open rows, or the files of tests of its folder."""
         tests = _TESTS.get(self.name.split('.')[0])
-        return sorted(f'test/{path.name}' for path in (_ROOT / 'test').glob(tests)) if tests else (
+        return sorted(f'test/{path.name}' for path in (ROOT / 'test').glob(tests)) if tests else (
             cases())
 
     def moved(self, up: bool) -> str | None:
@@ -85,7 +86,7 @@ class Number:
 def numbers() -> Iterator[Number]:
     """Yield every number of a constant at the level of a module, but the seeds."""
     for room in _ROOMS:
-        for path in sorted((_ROOT / _PACKAGE / room).glob('*.py')):
+        for path in sorted((ROOT / _PACKAGE / room).glob('*.py')):
             for node in ast.parse(path.read_text()).body:
                 if isinstance(node, ast.Assign):
                     targets, value = node.targets[0], node.value
@@ -109,7 +110,7 @@ def numbers() -> Iterator[Number]:
                         if 'SEED' not in name and leaf.end_col_offset is not None:
                             yield Number(
                                 f'{room}.{path.stem}.{name}' + f'#{index}' * (len(found) > 1),
-                                str(path.relative_to(_ROOT)), leaf.lineno, leaf.col_offset,
+                                str(path.relative_to(ROOT)), leaf.lineno, leaf.col_offset,
                                 leaf.end_col_offset, leaf.value)
 
 
@@ -125,23 +126,30 @@ def noticed(number: Number, up: bool, asked: Sequence[str]) -> str:
     moved = number.moved(up)
     if moved is None or not asked:
         return ''
-    path = Path(_copy().name, number.path)
-    before = path.read_text()
-    lines = before.splitlines(keepends=True)
-    line = lines[number.line - 1]
-    lines[number.line - 1] = line[:number.start] + moved + line[number.end:]
-    path.write_text(''.join(lines))
-    try:
+    line = Path(ROOT, number.path).read_text().splitlines()[number.line - 1]
+    with changed(number.path, number.line, line[:number.start] + moved + line[number.end:]):
         return fails(asked) if asked[0].startswith('test/') else differs(asked)
+
+
+@contextmanager
+def changed(path: str, number: int, line: str) -> Iterator[None]:
+    """Replace a line of a file in the copy."""
+    file = Path(_copy().name, path)
+    before = file.read_text()
+    lines = before.split('\n')
+    lines[number - 1] = line
+    file.write_text('\n'.join(lines))
+    try:
+        yield
     finally:
-        path.write_text(before)
+        file.write_text(before)
 
 
 @cache
 def _copy() -> 'tempfile.TemporaryDirectory[str]':
     """Return a compiled copy of the package, whose files are moved one after the other."""
     copy = tempfile.TemporaryDirectory()
-    shutil.copytree(_ROOT / _PACKAGE, Path(copy.name, _PACKAGE))
+    shutil.copytree(ROOT / _PACKAGE, Path(copy.name, _PACKAGE))
     compileall.compile_dir(copy.name, quiet=1)
     return copy
 
@@ -152,7 +160,7 @@ def differs(asked: Sequence[str]) -> str:
 
     A search that does not end is another result, too.
     """
-    command = [sys.executable, str(_ROOT / 'benchmarks' / 'decisions.py'), 'check', '--first',
+    command = [sys.executable, str(ROOT / 'benchmarks' / 'decisions.py'), 'check', '--first',
                *asked]
     environment = {**os.environ, 'PYTHONPATH': _copy().name, 'PYTHONDONTWRITEBYTECODE': '1'}
     with tempfile.TemporaryFile('w+') as names:
@@ -172,14 +180,14 @@ def fails(tests: Sequence[str]) -> str:
 
     One that does not end has failed, too.
     """
-    paths = f'pythonpath={_copy().name} {_ROOT / "benchmarks"}'
+    paths = f'pythonpath={_copy().name} {ROOT / "benchmarks"}'
     command = [sys.executable, '-m', 'pytest', '-x', '-q', '--tb=no', '-p', 'no:cacheprovider',
-               '-m', _MARKS, '-o', paths, *tests]
+               '-m', MARKS, '-o', paths, *tests]
     environment = {**os.environ, 'PYTHONPATH': _copy().name, 'PYTHONSAFEPATH': '1',
                    'PYTHONDONTWRITEBYTECODE': '1'}
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST,
-                              cwd=_ROOT, env=environment)
+                              cwd=ROOT, env=environment)
     except subprocess.TimeoutExpired:
         return tests[0]
     names = [line.split(' ', 1)[1].split(' - ')[0] for line in done.stdout.splitlines()
