@@ -44,8 +44,10 @@ class WaveformParts:
     def without_one(self, waveform: Array) -> Array:
         """Return the waveforms (part, channel, angle) of all cycles but one part each."""
         counts = self.counts[:, None, None]
-        return np.asarray((counts.sum() * waveform - counts * self.waveforms)
-                          / (counts.sum() - counts))
+        left = waveform - self.waveforms
+        left *= counts / (counts.sum() - counts)
+        left += waveform
+        return np.asarray(left)
 
 
 def waveform_parts(means: Sequence[BlockMean]) -> WaveformParts | None:
