@@ -305,7 +305,7 @@ class RunningIndicators:
         Raises SignalError and ParameterError as `condition_indicators` does, and SignalError if
         the number of channels changes. After an error the history is unchanged.
         """
-        samples = np.asarray(average, float)
+        samples = np.ascontiguousarray(average, float)
         count, channels = self._latest.averages, len(self._latest.values)
         if samples.ndim != 2 or (count > 0 and samples.shape[0] != channels):
             expected = channels if count else 'any number of'
@@ -502,9 +502,8 @@ def _moments_together(samples: Array, settings: GearSettings) -> _Moments:
     own = np.stack([rms * peak, extents[..., 0], extents[..., 0] / peak / _defined(rms),
                     _mean_product(square, square) / _defined(rms) ** 4,
                     *(unknown,) * (len(INDICATORS) - 4)], axis=-1)
-    if signals is None:
-        return _Moments(own, extents, peak, *(unknown,) * 7)
-    return _of_gear(signals, settings, _Moments(own, extents, peak, *(unknown,) * 7), rms)
+    moments = _Moments(own, extents, peak, *(unknown,) * 7)
+    return moments if signals is None else _of_gear(signals, settings, moments, rms)
 
 
 def _of_gear(signals: GearSignals, settings: GearSettings, moments: _Moments, rms: Array
@@ -547,8 +546,7 @@ def _defined(denominator: Array) -> Array:
 
 
 def _squares(signal: Array, peak: Array) -> Array:
-    scaled = signal * (1.0 / peak)[..., None]
-    return np.asarray(np.square(scaled, out=scaled))
+    return np.asarray(np.square(signal * (1.0 / peak)[..., None]))
 
 
 def _mesh_envelope(spectrum: Array, points: int, settings: GearSettings) -> Array:

@@ -112,13 +112,10 @@ class BlockMean:
             return
         step = other._first - self._first
         moved = other.count * step
-        self._sum += other._sum
-        self._sum += moved
-        moved += other._sum
-        moved += other._sum
+        self._sum += other._sum + moved
+        moved += 2.0 * other._sum
         moved *= np.conj(step)
-        self._squares += other._squares
-        self._squares += moved.real
+        self._squares += other._squares + moved.real
         self.count += other.count
 
     @property
