@@ -204,6 +204,18 @@ def gear_lines(settings: GearSettings, points: int) -> GearLines:
         first_sidebands=neighbours(fundamentals, 1))
 
 
+def _checked(average: ArrayLike) -> Array:
+    """Return the samples of an average; raises SignalError as `separate` does."""
+    samples = np.asarray(average, float)
+    if samples.size == 0 or samples.ndim == 0 or samples.shape[-1] < 2:
+        raise SignalError(f'average of shape {samples.shape}: its last dimension is the angle and '
+                          'must have 2 points or more, the others 1 or more')
+    if not max(samples.max(), -samples.min()) < _LARGEST_SAMPLE:
+        raise SignalError(f'average with samples that are not finite or not below '
+                          f'{_LARGEST_SAMPLE:g}: leave this average out')
+    return samples
+
+
 def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
     """
     Return the gear signals of a synchronous average over one revolution, (..., n).
@@ -219,13 +231,7 @@ def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
     >>> float(signals.amplitudes[7].round(3))
     0.1
     """
-    samples = np.asarray(average, float)
-    if samples.size == 0 or samples.ndim == 0 or samples.shape[-1] < 2:
-        raise SignalError(f'average of shape {samples.shape}: its last dimension is the angle and '
-                          'must have 2 points or more, the others 1 or more')
-    if not np.all(np.abs(samples) < _LARGEST_SAMPLE):
-        raise SignalError(f'average with samples that are not finite or not below '
-                          f'{_LARGEST_SAMPLE:g}: leave this average out')
+    samples = _checked(average)
     points = samples.shape[-1]
     lines = gear_lines(settings, points)
     spectrum = np.fft.rfft(samples)
@@ -299,7 +305,7 @@ class RunningIndicators:
         Raises SignalError and ParameterError as `condition_indicators` does, and SignalError if
         the number of channels changes. After an error the history is unchanged.
         """
-        samples = np.asarray(average, float)
+        samples = np.ascontiguousarray(average, float)
         count, channels = self._latest.averages, len(self._latest.values)
         if samples.ndim != 2 or (count > 0 and samples.shape[0] != channels):
             expected = channels if count else 'any number of'
@@ -315,7 +321,7 @@ class RunningIndicators:
             item[:, lost] = np.nan
         if parts is not None:
             moments = moments.levelled(parts.counts).with_extents(parts, self._settings)
-        values = self._history.take(moments, self._settings)
+        values = self._history.take(moments)
         error = np.full(values[0].shape, np.nan)
         if parts is not None and len(replicates):
             with np.errstate(divide='ignore', invalid='ignore'):
@@ -379,7 +385,7 @@ def condition_indicators(
     settings = settings or GearSettings()
     moments = _moments(samples if samples.ndim == 3 else samples[None], settings)
     history = _History()
-    values = np.concatenate([history.take(moments.part(i), settings)
+    values = np.concatenate([history.take(moments.part(i))
                              for i in range(len(moments.peak))])
     if samples.ndim == 2:
         values = values[0]
@@ -448,26 +454,28 @@ class _Moments(NamedTuple):
         """
         weight = (parts.counts / parts.counts.sum())[:, None, None]
         points = parts.waveforms.shape[-1]
-        of_parts = _extents(parts.waveforms, 2.0 / points * np.abs(np.fft.rfft(parts.waveforms)),
-                            gear_lines(settings, points).mesh)
+        mesh: Array = np.zeros(parts.waveforms.shape[:-1])
+        if settings.mesh_orders:
+            amplitudes = 2.0 / points * np.abs(np.fft.rfft(parts.waveforms))
+            mesh = amplitudes[..., gear_lines(settings, points).mesh].sum(axis=-1)
+        of_parts = _extents(parts.waveforms, parts.waveforms.mean(axis=-1), mesh)
         among = (weight * of_parts).sum(axis=0) - of_parts
         left_out = self.extents[1:] - self.extents[1:].mean(axis=0)
         extents = self.extents[0] + 0.5 * (weight / (1.0 - weight) * among + left_out)
         own = self.own.copy()
         with np.errstate(divide='ignore', invalid='ignore'):
-            farthest, width, mesh = np.moveaxis(extents / self.extents[1:], -1, 0)
+            farthest, width, total = np.moveaxis(extents / self.extents[1:], -1, 0)
             for name, change in (('peak', farthest), ('crest_factor', farthest),
-                                 ('fm0', width / mesh)):
+                                 ('fm0', width / total)):
                 own[1:, :, INDICATORS.index(name)] *= change
         return self._replace(own=own)
 
 
-def _extents(samples: Array, amplitudes: Array, mesh: Array) -> Array:
-    """Return the `extents` of `_Moments`; `mesh` are the orders of it among the amplitudes."""
+def _extents(samples: Array, mean: Array, mesh: Array) -> Array:
+    """Return the `extents` of `_Moments`; `mesh` is the sum of the amplitudes of the mesh."""
     largest, smallest = samples.max(axis=-1), samples.min(axis=-1)
-    mean = samples.mean(axis=-1)
     return np.stack((np.maximum(largest - mean, mean - smallest), largest - smallest,
-                     amplitudes[..., mesh].sum(axis=-1)), axis=-1)
+                     mesh), axis=-1)
 
 
 def _mean_product(a: Array, b: Array) -> Array:
@@ -484,61 +492,65 @@ def _moments(samples: Array, settings: GearSettings) -> _Moments:
 
 def _moments_together(samples: Array, settings: GearSettings) -> _Moments:
     """Return the moments of averages of some channels, few enough for the cache."""
-    signals = separate(samples, settings)
-    lines = signals.lines
-    mean, extents = samples.mean(axis=-1), _extents(samples, signals.amplitudes, lines.mesh)
+    mean, unknown = _checked(samples).mean(axis=-1), np.full(samples.shape[:-1], np.nan)
+    signals = separate(samples, settings) if settings.mesh_orders else None
+    extents = _extents(samples, mean, np.zeros(mean.shape) if signals is None else
+                       signals.amplitudes[..., signals.lines.mesh].sum(axis=-1))
     peak = np.maximum(np.abs(mean) + extents[..., 0], np.sqrt(np.finfo(float).tiny))
+    square = _squares(samples - mean[..., None], peak)
+    rms = np.sqrt(square.mean(axis=-1))
+    own = np.stack([rms * peak, extents[..., 0], extents[..., 0] / peak / _defined(rms),
+                    _mean_product(square, square) / _defined(rms) ** 4,
+                    *(unknown,) * (len(INDICATORS) - 4)], axis=-1)
+    moments = _Moments(own, extents, peak, *(unknown,) * 7)
+    return moments if signals is None else _of_gear(signals, settings, moments, rms)
 
-    def defined(denominator: Array) -> Array:
-        return np.where(denominator > _ROUNDING, denominator, np.nan)
+
+def _of_gear(signals: GearSignals, settings: GearSettings, moments: _Moments, rms: Array
+             ) -> _Moments:
+    """Return `moments` with what needs mesh orders; `rms` is that of the average over the peak."""
+    lines, peak, own = signals.lines, moments.peak, moments.own
 
     def amplitude_sum(mask: Array) -> Array:
         return np.asarray(signals.amplitudes[..., mask].sum(axis=-1) / peak if mask.any()
                           else np.full(peak.shape, np.nan))
 
-    def squares(signal: Array) -> Array:
-        scaled = signal / peak[..., None]
-        return np.asarray(np.square(scaled, out=scaled))
-
-    square = squares(samples - mean[..., None])
-    rms = np.sqrt(square.mean(axis=-1))
-    farthest, width = extents[..., 0] / peak, extents[..., 1] / peak
-    fourth = _mean_product(square, square)
-    square = squares(signals.residual)
+    square = _squares(signals.residual, peak)
     residual, residual_4 = square.mean(axis=-1), _mean_product(square, square)
-    square = squares(signals.difference)
+    square = _squares(signals.difference, peak)
     difference = square.mean(axis=-1)
     power = np.square(square)
-    deviation = defined(np.sqrt(difference))
+    deviation = _defined(np.sqrt(difference))
     difference_6, difference_8 = _mean_product(power, square), _mean_product(power, power)
-    envelope = _mesh_envelope(signals.spectrum, samples.shape[-1], settings)
-    square = squares(envelope - envelope.mean(axis=-1, keepdims=True))
+    envelope = _mesh_envelope(signals.spectrum, signals.regular.shape[-1], settings)
+    square = _squares(envelope - envelope.mean(axis=-1, keepdims=True), peak)
     regular = np.sqrt(np.maximum(rms**2 - difference, 0.0))
-    unknown = np.full(peak.shape, np.nan)
-    own = np.stack([
-        rms * peak,
-        farthest * peak,
-        farthest / defined(rms),
-        fourth / defined(rms) ** 4,
-        width / defined(amplitude_sum(lines.mesh)),
-        power.mean(axis=-1) / deviation**4,
-        difference_6 / deviation**6,
-        difference_8 / deviation**8,
-        unknown,
-        np.sqrt(difference) / defined(regular),
-        amplitude_sum(lines.fundamental_sidebands) / defined(amplitude_sum(lines.fundamentals)),
-        amplitude_sum(lines.first_sidebands) / defined(rms),
-        unknown, unknown, unknown, unknown,
-    ], axis=-1)
-    return _Moments(
-        own, extents, peak, residual, residual_4, difference, difference_6, difference_8,
-        square.mean(axis=-1), _mean_product(square, square))
+    for name, value in (
+            ('fm0', moments.extents[..., 1] / peak / _defined(amplitude_sum(lines.mesh))),
+            ('fm4', power.mean(axis=-1) / deviation**4),
+            ('m6a', difference_6 / deviation**6),
+            ('m8a', difference_8 / deviation**8),
+            ('energy_ratio', np.sqrt(difference) / _defined(regular)),
+            ('sideband_ratio', amplitude_sum(lines.fundamental_sidebands)
+             / _defined(amplitude_sum(lines.fundamentals))),
+            ('sideband_level_factor', amplitude_sum(lines.first_sidebands) / _defined(rms))):
+        own[..., INDICATORS.index(name)] = value
+    return moments._replace(
+        residual=residual, residual_4=residual_4, difference=difference,
+        difference_6=difference_6, difference_8=difference_8, envelope=square.mean(axis=-1),
+        envelope_4=_mean_product(square, square))
+
+
+def _defined(denominator: Array) -> Array:
+    return np.where(denominator > _ROUNDING, denominator, np.nan)
+
+
+def _squares(signal: Array, peak: Array) -> Array:
+    return np.asarray(np.square(signal * (1.0 / peak)[..., None]))
 
 
 def _mesh_envelope(spectrum: Array, points: int, settings: GearSettings) -> Array:
     """Return the envelope (..., angle) of the lowest mesh order and those around it."""
-    if not settings.mesh_orders:
-        return np.full((*spectrum.shape[:-1], 1), np.nan)
     mesh = min(int(order) for order in settings.mesh_orders)
     reach = min(mesh // 2, mesh - 1, (points - 1) // 2 - mesh)
     count = next_fast_len(_ENVELOPE_POINTS * (2 * reach + 1))
@@ -596,7 +608,7 @@ class _History:
         self._nominal_residual, self._nominal_difference = _Reference(True), _Reference(True)
         self.variance: Array = np.zeros(())
 
-    def take(self, moments: _Moments, settings: GearSettings) -> Array:
+    def take(self, moments: _Moments) -> Array:
         """
         Return the indicators (replicate, channel, indicator) of the next average.
 
@@ -624,6 +636,4 @@ class _History:
             place = INDICATORS.index(name)
             values[..., place] = over(moment, reference, power)
             self.variance[..., place] = power**2 * kind.uncertainty
-        if not settings.mesh_orders:
-            values[..., INDICATORS.index('fm0'):] = np.nan
         return values

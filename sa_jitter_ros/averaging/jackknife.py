@@ -43,9 +43,8 @@ class WaveformParts:
 
     def without_one(self, waveform: Array) -> Array:
         """Return the waveforms (part, channel, angle) of all cycles but one part each."""
-        counts = self.counts[:, None, None]
-        return np.asarray((counts.sum() * waveform - counts * self.waveforms)
-                          / (counts.sum() - counts))
+        share = (self.counts / (self.counts.sum() - self.counts))[:, None, None]
+        return np.asarray(waveform + share * (waveform - self.waveforms))
 
 
 def waveform_parts(means: Sequence[BlockMean]) -> WaveformParts | None:
@@ -64,7 +63,7 @@ def waveform_parts(means: Sequence[BlockMean]) -> WaveformParts | None:
     if not all(group.count for group in groups):
         return None
     return WaveformParts(np.array([group.count for group in groups], float),
-                         np.stack([group.mean.T for group in groups]))
+                         np.ascontiguousarray(np.stack([group.mean.T for group in groups])))
 
 
 def jackknife_variance(value: Array, without_one: Array, counts: Array) -> Array:

@@ -111,9 +111,11 @@ class BlockMean:
             self._sum, self._squares = other._sum.copy(), other._squares.copy()
             return
         step = other._first - self._first
-        self._sum += other._sum + other.count * step
-        self._squares += other._squares + other.count * _power(step)
-        self._squares += 2.0 * (step * np.conj(other._sum)).real
+        moved = other.count * step
+        self._sum += other._sum + moved
+        moved += 2.0 * other._sum
+        moved *= np.conj(step)
+        self._squares += other._squares + moved.real
         self.count += other.count
 
     @property

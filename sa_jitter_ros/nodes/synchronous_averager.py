@@ -65,6 +65,7 @@ class SynchronousAverager(MonitoringNode):
         self._check(values)
         self._apply_indicators(values)
         self._values = values
+        self._revolutions = keyphasor_parameters(values).revolutions_per_trigger
         self._keyphasor: str | None = values['keyphasor'] or None
         self._sources: set[str] = set()  # of tach pulses
         self._other_keyphasors = 0
@@ -100,6 +101,7 @@ class SynchronousAverager(MonitoringNode):
     def _apply(self, values: Values) -> None:
         before, self._values = self._values, values
         keyphasor = keyphasor_parameters(values)
+        self._revolutions = keyphasor.revolutions_per_trigger
         if keyphasor != keyphasor_parameters(before):
             self._averager.change_pulses(keyphasor.validator())
         changed = {name: shaft_settings(values, name) for name in self._shafts}
@@ -145,7 +147,6 @@ class SynchronousAverager(MonitoringNode):
         self._publish(self._averager.add_pulses(times))
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
-        revolutions = keyphasor_parameters(self._values).revolutions_per_trigger
         pause = 0.0 if self._values['averaging'] == 'block' else _SUMMARY_PAUSE
         for name, average in averages:
             self._average_flow.came()
@@ -155,10 +156,10 @@ class SynchronousAverager(MonitoringNode):
                 self._latest[name].append(average)
                 self.set_missing(f'lines of {name}', without_lines(
                     self._latest[name], fewest=_LATEST))
-        speed = self._averager.take_speed() * revolutions
+        speed = self._averager.take_speed() * self._revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
-            self._cycles_per_second = speed / revolutions
+            self._cycles_per_second = speed / self._revolutions
         for name, doubt in self._averager.doubts.items():
             self.set_missing(f'pulses against the vibration of {name}', doubt)
         geometry = self._averager.geometry
