@@ -293,18 +293,13 @@ def _beside(observation: Observation, lines: Lines, tone: Tone, relative: Array)
     """Return what of `relative` amplitudes (acquisition, cycle, line), less 1, a tone makes."""
     order = observation.orders[lines.order]
     places = np.arange(relative.shape[1]) + 0.5  # middles of cycles
-    times = np.array([np.interp(places, item.number, corrected)
-                      for item, corrected in _corrected(observation)])
+    times = np.array([np.interp(places, item.number, item.true_times)
+                      for item in observation.acquisitions])
     angle = observation.model.cycle_length * np.array(
         [observation.pulses.number[item.first] + places for item in observation.acquisitions])
     turns = tone.frequency * times[..., None] - angle[..., None] * order
     wave = np.exp(2j * np.pi * turns)
     return np.asarray(np.mean(relative * wave.conj(), axis=(0, 1)) * wave)
-
-
-def _corrected(observation: Observation) -> list[tuple[Acquisition, Array]]:
-    """Return the acquisitions, each with its pulse times (pulse,) without recovered errors."""
-    return [(item, item.times - np.nan_to_num(item.errors)) for item in observation.acquisitions]
 
 
 def _sidebands(observation: Observation, count: int) -> Array:
@@ -331,9 +326,9 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
               key=lambda item: item.errors.size, default=None)
     if fit is None:
         return None
-    speed = model.cycle_length / np.mean([np.ptp(corrected) / np.ptp(item.number)
-                                          for item, corrected in _corrected(observation)])
-    frequency = np.append(fit.orders * speed, fit.tones)
+    period = np.mean([np.ptp(item.true_times) / item.number[-1]
+                      for item in observation.acquisitions])
+    frequency = np.append(fit.orders * model.cycle_length / period, fit.tones)
     amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
     chosen = np.flatnonzero(~fit.synchronous)
     if not chosen.size:

@@ -100,6 +100,11 @@ class Acquisition:
         return numbered(self.missing)
 
     @property
+    def true_times(self) -> FloatArray:
+        """Return the times of the measured pulses less their recovered errors, in s."""
+        return self.times - np.nan_to_num(self.errors)
+
+    @property
     def period(self) -> float:
         """Return the mean trigger period in s."""
         return mean_period(self.times, self.missing)
