@@ -102,9 +102,8 @@ class StateLevels:
 
     def still_passed(self, passed: 'StateLevels', size: float) -> bool:
         """Return whether these levels are among those `passed` by pulses of about the `size`."""
-        margin = _DEAD_BAND * self.difference
-        return (passed.low - margin <= self.low and self.high <= passed.high + margin
-                and size <= 2.0 * (self.highest - self.lowest))
+        off = max(passed.low - self.low, self.high - passed.high)
+        return off <= _DEAD_BAND * self.difference and size <= 2.0 * (self.highest - self.lowest)
 
     def negated(self) -> 'StateLevels':
         """Return the levels of the waveform with the other sign."""
@@ -120,10 +119,9 @@ class StateLevels:
         """
         reach = self.highest - self.lowest
         spikes = (samples > self.highest + reach) | (samples < self.lowest - reach)
-        if spikes.any():
-            for first, last in zip(*(item.tolist() for item in _runs(spikes))):
-                if last - first > _SHORT:
-                    spikes[first:last] = False
+        for first, last in zip(*(item.tolist() for item in _runs(spikes))):
+            if last - first > _SHORT:
+                spikes[first:last] = False
         return np.asarray(spikes)
 
 
@@ -256,8 +254,7 @@ def _passed_by_all(samples: FloatArray) -> StateLevels | None:
     widest = max(held, key=lambda k: ((end[k] - begin[k]) // _GAP, -crossed[begin[k]]))
     edges = low + (np.array([begin[widest], end[widest]]) + 1) * (high - low) / _BINS
     passed = StateLevels(float(edges[0]), float(edges[1]), significant=True)
-    clear = _contrast(samples, samples > passed.middle) > 2.0 * _CONTRAST
-    return passed if clear else None
+    return passed if _contrast(samples, samples > passed.middle) > 2.0 * _CONTRAST else None
 
 
 def _contrast(samples: FloatArray, upper: BoolArray) -> float:
