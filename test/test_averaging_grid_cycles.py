@@ -28,3 +28,9 @@ def test_compact_cycles_keep_what_their_orders_tell(rng, samples, orders, fewer)
     np.testing.assert_allclose(columns.T @ columns, rows.T @ rows, atol=1e-9 * samples)
     np.testing.assert_allclose(columns.T @ flat, rows.T @ whole, atol=1e-9 * samples)
     assert grid.compact(rows, max(orders))[1] is flat or not fewer  # not computed again
+
+
+def test_cycles_are_not_compact_where_that_leaves_less_than_their_columns(rng):
+    grid = GridCycles(rng.standard_normal((6, 864, 1)))
+    assert [len(grid.compact(rng.standard_normal((864, columns)), 6.0)[0]) == 864
+            for columns in (10, 119)] == [False, True]

@@ -305,6 +305,23 @@ def test_waveforms_of_sensors(kind, sign, rng):
         assert detector.state.polarity == ('positive' if sign > 0.0 else 'negative')
 
 
+@pytest.mark.parametrize('mains', [50.0, 60.0])
+@pytest.mark.parametrize('duty', [0.04, 0.1, 0.5])
+def test_hum_of_a_third_of_the_pulses_costs_none(mains, duty, rng):
+    t = np.arange(50_000) / 10e3
+    wave = 5.0 * ((24.7 * t - 0.3) % 1.0 < duty) + 1.5 * np.sin(2.0 * np.pi * mains * t + 1.0)
+    pulses, _ = detect(wave + 0.02 * rng.standard_normal(t.size), rate=10e3)
+    assert pulses == pytest.approx((np.arange(pulses.size) + 0.3) / 24.7, abs=1.1e-4)
+    assert pulses.size == 124
+
+
+def test_pulses_of_three_steps_of_the_converter(rng):
+    t = np.arange(50_000) / 10e3
+    wave = np.rint(3.0 * ((31.0 * t - 0.3) % 1.0 < 0.1) + rng.normal(0.0, 0.25, t.size))
+    pulses, _ = detect(wave, rate=10e3)
+    assert pulses == pytest.approx((np.arange(155.0) + 0.3) / 31.0, abs=2.1e-4)
+
+
 @pytest.mark.parametrize('duty', [0.02, 0.1, 0.44, 0.5, 0.56, 0.9, 0.98])
 def test_automatic_polarity_is_that_of_the_rarer_state(duty, rng):
     t = np.arange(50_000) / 5000.0
@@ -359,6 +376,14 @@ def test_spoilt_samples_cost_only_the_pulses_near_them():
         wrong += clean.size != found.size or not np.allclose(clean, found, atol=2.0 / rate)
     # a long piece at the beginning, where no level is known yet, may cost more
     assert wrong <= 0.02 * trials
+
+
+def test_a_spoilt_piece_beside_levels_that_differ_by_rounding_only():
+    wave = np.tile(np.repeat([0.02, 0.021], [80, 20]), 60) * (1.0 + 1e-15 * np.arange(6000))
+    wave[2000:5000] = 0.02 + 5e-17 * (np.arange(3000) % 2)
+    wave[4000] = 7.0
+    pulses, detector = detect(wave, rate=1000.0)
+    assert (pulses.size, detector.state.spikes) == (30, 1)
 
 
 def test_offset_and_gain_change_nothing(rng):

@@ -388,3 +388,19 @@ def test_what_was_bridged_is_said():
 def test_unusable_angles_are_refused_in_a_line(angle, options, error, message):
     with pytest.raises(error, match=message):
         sa.pulses_from_angle([0.0], angle, **options)
+
+
+@pytest.mark.parametrize('turn', [360.0, 1.0])
+def test_an_angle_in_another_unit_has_any_number_of_marks(turn):
+    time = np.arange(4000) / 1e3
+    angle = (9.3 * time + 0.3) % 1.0 * turn
+    for marks in (1, 16):
+        pulses = sa.pulses_from_angle(time, angle, pulses_per_revolution=marks, modulus=turn)
+        assert np.diff(pulses) == pytest.approx(1.0 / 9.3 / marks, abs=1e-9)
+        assert pulses.size == pytest.approx(37.2 * marks, abs=1)
+
+
+def test_an_angle_that_wraps_at_360_is_told():
+    time = np.arange(4000) / 1e3
+    with pytest.warns(sa.DataWarning, match='wraps at about 360, .* give modulus=360'):
+        sa.pulses_from_angle(time, 9.3 * time % 1.0 * 360.0)

@@ -130,7 +130,9 @@ class GridCycles:
         flat = self.samples.reshape(len(self.samples), -1)
         length = _PANEL_CYCLES * len(flat) / (cycles + _PANEL_CYCLES)
         length = int(_LENGTHS ** np.floor(np.log(length) / np.log(_LENGTHS)))
-        if length < _LEAST_GAIN * _PANEL_DEGREES:
+        # Without as many numbers as columns the columns would not be independent.
+        enough = len(flat) // max(length, 1) * _PANEL_DEGREES >= rows.shape[1]
+        if length < _LEAST_GAIN * _PANEL_DEGREES or not enough:
             return rows, flat
         if length not in self._compact:
             self._compact[length] = _in_panels(flat, length)

@@ -17,7 +17,6 @@ time of the first sample past the threshold, as Camerini et al. 2019 (Fig. 2) mo
 keyphasor.
 """
 
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -44,10 +43,6 @@ Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first
 _STOPPED = 0.1
 # Fraction of the level difference by which the levels of the same signal may have drifted.
 _DRIFTED = 0.5
-# Earlier levels that are taken up again at once.
-_TRUSTED = 3
-# Part of a window that one event may take.
-_EVENT = 0.25
 # Part of a lobe that a signal must pass on either side of the resting level.
 _PASSED = 0.4
 # Share of the samples above the middle from which on pulses are taken for negative.
@@ -145,8 +140,6 @@ class KeyphasorDetector:
         self._levels: StateLevels | None = None
         self._confirmed = False
         self._pending: StateLevels | None = None
-        # earlier ones that windows agreed on
-        self._trusted: deque[StateLevels] = deque(maxlen=_TRUSTED)
         self._bridge = np.nan  # the last sample that is no spike
         self._trigger = SchmittTrigger(interpolate=self._interpolate)
         self._trigger_origin = np.nan
@@ -231,7 +224,9 @@ class KeyphasorDetector:
         """Learn the levels from a full window; return its pulses if they waited for the levels."""
         window = np.concatenate([part for *_, part in self._window])
         known = self._levels
-        levels = state_levels(window if known is None else _without_event(window, known), known)
+        levels = state_levels(window[~known.spikes(window)] if known else window, known)
+        if known and not levels.significant:  # larger pulses, perhaps
+            levels = state_levels(window, known)
         useful = levels.significant and levels.difference > self._minimum_difference
         if known and levels.difference < _STOPPED * known.difference and (
                 self._confirmed and not levels.pulsed):
@@ -252,10 +247,8 @@ class KeyphasorDetector:
                 self._levels = levels
             if not self._confirmed:
                 self._confirmed = True
-                self._trusted.append(levels)
-        elif not self._confirmed or self._idle(window, known) or any(
-                levels.resembles(item, _DRIFTED)
-                for item in (*self._trusted, self._pending) if item):
+        elif not self._confirmed or self._idle(window, known) or (
+                self._pending and levels.resembles(self._pending, _DRIFTED)):
             self._levels, self._pending, self._confirmed = levels, None, False
         else:
             self._pending = levels
@@ -281,8 +274,8 @@ class KeyphasorDetector:
 
     def _bridged(self, samples: FloatArray, levels: StateLevels) -> FloatArray:
         """Return the samples with the last sound one in place of spikes, which are counted."""
-        spikes = levels.short_spikes(samples)
-        if spikes is not None:
+        spikes = levels.spikes(samples)
+        if spikes.any():
             self._spikes += int(np.count_nonzero(spikes))
             sound = np.maximum.accumulate(np.where(spikes, -1, np.arange(samples.size)))
             before = levels.low if np.isnan(self._bridge) else self._bridge
@@ -337,15 +330,6 @@ class KeyphasorDetector:
         if times.size:
             self._last_pulse = float(times[-1])
         return times
-
-
-def _without_event(window: FloatArray, known: StateLevels) -> FloatArray:
-    """Return the samples of a window without a single event far beyond the known levels."""
-    spikes = known.spikes(window)
-    if spikes is None:
-        return window
-    places = np.flatnonzero(spikes)
-    return window[~spikes] if places[-1] - places[0] < _EVENT * window.size else window
 
 
 def _last(pieces: list[Piece], count: int) -> list[Piece]:

@@ -30,6 +30,7 @@ from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
 
 _TURN = 2.0 * math.pi
+_OTHER_TURNS, _SIMILAR = (360.0, 1.0), 0.1  # of an angle that is not in rad; part of them
 _BEFORE, _AFTER = 3, 3  # samples around a crossing
 _KEPT = 32  # samples before the next crossing
 # Within so many seconds a shaft that turns passes this part of the pitch of its marks.
@@ -399,7 +400,8 @@ def pulses_from_angle(
     Return the pulse times (pulse,) in s of a sampled angle (sample,), as from a target on it.
 
     The `angle` of a resolver or joint is in rad and may wrap at any multiple of 2 pi, or at
-    `modulus`, in rad. An angle of integers, or with a whole `modulus`, is in counts. A turn is
+    `modulus`, in rad. If `modulus` is a whole number it is a turn in another unit, of 360 degrees
+    or 1. An angle of integers, or of whole numbers with a whole `modulus`, is in counts. A turn is
     then `modulus` counts, if `pulses_per_revolution` divides it; otherwise each count is a pulse,
     and `pulses_per_revolution` counts are a turn. For a register that holds some turns, `modulus`
     may be the counts of one turn; overflows of 8, 16 and 32 bits are seen in any case.
@@ -429,37 +431,41 @@ def pulses_from_angle(
     if not (marks >= 1.0 and marks.is_integer()):
         raise ParameterError(f'pulses_per_revolution {marks:g} must be a whole number, 1 or more')
     values = np.asarray(angle)
-    whole = values.dtype.kind in 'iu'
-    if modulus is not None:
-        modulus = number('modulus', modulus)
-        whole |= modulus.is_integer()
-        least = _LEAST_MODULUS if whole else 0.0
-        if not least <= modulus < np.inf or modulus == 0.0:
-            raise ParameterError(f'modulus {modulus:g} must be finite and '
-                                 + (f'{least:g} counts or more' if whole else 'above 0 rad'))
     if values.ndim != 1 or values.dtype.kind not in 'fiu':
         raise SignalError(f'angle of shape {values.shape} and type {values.dtype}: give one row '
                           'of real numbers, in rad or counts')
     finite = values[np.isfinite(values)].astype(np.float64)
+    whole, turn = values.dtype.kind in 'iu', _TURN
+    if modulus is not None:
+        modulus = number('modulus', modulus)
+        turn = modulus if modulus.is_integer() and modulus > 0.0 else _TURN
+        whole |= modulus.is_integer() and not np.any(finite % 1.0)
+        least = _LEAST_MODULUS if whole else 0.0
+        if not least <= modulus < np.inf or modulus == 0.0:
+            raise ParameterError(f'modulus {modulus:g} must be finite and '
+                                 + (f'{least:g} counts or more' if whole else 'above 0 rad'))
     if whole:
         if np.any(np.abs(finite) > _EXACT):
             raise SignalError(f'a count of {np.max(np.abs(finite)):.0f} is above 2^53 and not '
                               'exact: subtract the first one')
         crossings = _of_counter(finite, int(marks), modulus or 0.0)
     else:
-        crossings = AngleCrossings(marks=int(marks), runs=AngleRuns(
-            _TURN, moduli=(_TURN, modulus) if modulus else (_TURN,)))
+        crossings = AngleCrossings(marks=int(marks), turn=turn, runs=AngleRuns(
+            turn, moduli=(turn, modulus or turn)))
     pulses = np.append(crossings.update(times, values), crossings.flush())
     state = crossings.state
-    unit = 'counts' if whole else 'rad'
     if not pulses.size:
-        seen = (f'go from {finite.min():g} to {finite.max():g} {unit}' if finite.size
-                else 'hold no finite one')
+        seen = (f'go from {finite.min():g} to {finite.max():g} {"counts" if whole else "rad"}'
+                if finite.size else 'hold no finite one')
         warnings.warn(f'the angle has no pulses: its {values.size} samples {seen}; check its '
                       'unit, the modulus, and that the shaft turns', DataWarning, stacklevel=2)
         return pulses
     found = [f'{state.glitches} samples of the angle are where the shaft cannot be, and were '
              'bridged'] * bool(state.glitches)
+    wraps = np.count_nonzero(np.abs(np.diff(finite)) > 0.5 * np.ptp(finite)) > 1
+    found += [f'the angle wraps at about {other:g}, no turn in rad: give modulus={other:g}'
+              for other in _OTHER_TURNS if turn == _TURN and not whole and wraps
+              and abs(np.ptp(finite) / other - 1.0) < _SIMILAR]
     found += [f'{state.restarts} jumps of angle or time that are no wrap began a new run'] * bool(
         state.restarts)
     if found:

@@ -107,7 +107,7 @@ def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, cou
         table = np.full((int(turns[-1]) + 1, teeth.size), np.nan)
         table[turns, index] = (times - smooth[place]) / pitch[place]
         table = table[1:-1]  # the speed of the first and the last one is known less
-        table = _clipped(table)
+        table = _clipped(table) if np.isfinite(table).any(axis=0).all() else table
         seen = np.count_nonzero(np.isfinite(table), axis=0)
         if seen.min() < _FEWEST - 2:
             return None

@@ -13,9 +13,10 @@ Threshold crossings of a keyphasor waveform, and the state levels between which 
 
 The state levels are the modes of the lower and of the upper half of the amplitude histogram (as in
 IEEE Std 181-2011), so that the length of a pulse and a few overshoots do not change them. Three
-things are told apart first: single spikes, which are far from both levels; a resting level that
-moves with the shaft, between whose range and the pulses there is a gap; and pulses with a lobe on
-either side of the resting level, as variable reluctance makes them. A crossing counts once the
+things are told apart: single spikes, which are far from both levels; a resting level that moves
+with the shaft or hum, between whose range and the tops of the pulses are levels that all pulses
+cross; and pulses with a lobe on either side of the resting level, as variable reluctance makes
+them. A crossing counts once the
 signal leaves a band around the threshold (Schmitt trigger).
 """
 
@@ -43,10 +44,10 @@ _DEAD_BAND = 0.1
 # Spikes: the most in a window, or one for so many pulses; samples of one that is as wide as a
 # pulse may be; and how often they are looked for, each time in a smaller range.
 _FEW_SPIKES, _PULSES_EACH, _SHORT, _SIZES = 2, 10, 3, 8
-# A gap between a moving resting level and the pulses: its least width in bins, the share of the
-# samples that may be in one of them, that which must be on either side, and the part of these that
-# all of the gap may have.
-_GAP, _EDGES, _HELD, _PASSING = 10, 0.002, 0.01, 0.3
+# Levels between a moving resting level and the tops of the pulses: their least width in bins, and
+# the share of the samples that must be on either side.
+_GAP, _HELD = 10, 0.01
+_CENTRAL = 0.25  # part of them, by which the middle of the modes may be beside theirs
 # Lobes of a pulse: the smaller over the larger one; the share of samples near the resting level,
 # and how near that is; the part of a lobe that counts; and the time from one lobe to the next in
 # widths of a lobe, beyond which they are pulses of their own.
@@ -99,29 +100,29 @@ class StateLevels:
                 and abs(self.middle - known.middle) <= within * known.difference
                 and 0.5 <= self.difference / known.difference <= 2.0)
 
+    def still_passed(self, passed: 'StateLevels', size: float) -> bool:
+        """Return whether these levels are among those `passed` by pulses of about the `size`."""
+        off = max(passed.low - self.low, self.high - passed.high)
+        return off <= _DEAD_BAND * self.difference and size <= 2.0 * (self.highest - self.lowest)
+
     def negated(self) -> 'StateLevels':
         """Return the levels of the waveform with the other sign."""
         steep = {'rising': 'falling', 'falling': 'rising'}.get(self.steep, '')
         return replace(self, low=-self.high, high=-self.low, resting=-self.resting, steep=steep,
                        share=1.0 - self.share, lowest=-self.highest, highest=-self.lowest)
 
-    def spikes(self, samples: FloatArray) -> BoolArray | None:
-        """Return which samples (n,) are farther from all others than these are apart, or None."""
-        reach = self.highest - self.lowest
-        if samples.max() <= self.highest + reach and samples.min() >= self.lowest - reach:
-            return None
-        return np.asarray((samples > self.highest + reach) | (samples < self.lowest - reach))
+    def spikes(self, samples: FloatArray) -> BoolArray:
+        """
+        Return which samples (n,) are in spikes.
 
-    def short_spikes(self, samples: FloatArray) -> BoolArray | None:
-        """Return which samples (n,) are in spikes that are too short for pulses, None for none."""
-        spikes = self.spikes(samples)
-        if spikes is None:
-            return None
-        begin, end = _runs(spikes)
-        for first, last in zip(begin.tolist(), end.tolist()):
+        These are farther from all others than those are apart, and too short for pulses.
+        """
+        reach = self.highest - self.lowest
+        spikes = (samples > self.highest + reach) | (samples < self.lowest - reach)
+        for first, last in zip(*(item.tolist() for item in _runs(spikes))):
             if last - first > _SHORT:
                 spikes[first:last] = False
-        return spikes if spikes.any() else None
+        return np.asarray(spikes)
 
 
 def state_levels(samples: FloatArray, known: StateLevels | None = None) -> StateLevels:
@@ -140,7 +141,13 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
         if levels.significant and levels.resembles(known):
             return known
     kept = _without_spikes(samples)
-    levels = _lobes(kept) or _beside_motion(kept) or _modes(kept)
+    levels = _lobes(kept) or _modes(kept)
+    if not levels.steep and (passed := _passed_by_all(kept)):
+        if known and not known.steep and known.still_passed(passed, float(np.ptp(kept))):
+            return known
+        central = abs(levels.middle - passed.middle) <= _CENTRAL * passed.difference
+        if not (levels.significant and central):
+            levels = passed
     if not levels.significant:
         return levels
     near = _CLOSE * levels.difference
@@ -151,12 +158,19 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
                    lowest=float(kept.min()), highest=float(kept.max()))
 
 
+def _range(samples: FloatArray) -> tuple[float, float]:
+    """Return the extremes, one level for samples that differ by rounding only, or for none."""
+    low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
+    rounding = 10 * _BINS * np.spacing(max(abs(low), abs(high)))
+    return (low, high) if high - low > rounding else (low, low)
+
+
 def _modes(samples: FloatArray) -> StateLevels:
     """Return the modes of both halves of the amplitudes."""
-    low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
+    low, high = _range(samples)
     half = 0.5 * (low + high)
     upper = samples > half
-    if samples.size < 3 or not low < half < high:
+    if not low < high:
         return StateLevels(low, high, significant=False)
     contrast = float(samples[upper].mean() - samples[~upper].mean())
     counts, edges = np.histogram(samples, bins=_BINS, range=(low, high))
@@ -195,8 +209,8 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
     """
     kept, spikes, longest = samples, 0, 0
     for _ in range(_SIZES):
-        low, high = (float(kept.min()), float(kept.max())) if kept.size else (0.0, 0.0)
-        if high - low <= 10 * _BINS * np.spacing(max(abs(low), abs(high))):  # one level is left
+        low, high = _range(kept)
+        if not low < high:
             break
         outside = kept > 0.5 * (low + high)
         if 2 * np.count_nonzero(outside) > kept.size:
@@ -215,25 +229,32 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
     return samples
 
 
-def _beside_motion(samples: FloatArray) -> StateLevels | None:
-    """Return the levels on either side of a gap between pulses and a resting level that moves."""
-    low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
+def _passed_by_all(samples: FloatArray) -> StateLevels | None:
+    """
+    Return the levels between which all pulses pass, whatever hum or motion adds, or None.
+
+    That is the widest range of levels that are crossed equally often, of about equal ones the one
+    that is crossed least.
+    """
+    low, high = _range(samples)
     if not low < high:
         return None
-    counts, edges = np.histogram(samples, bins=_BINS, range=(low, high))
-    begin, end = _runs(counts <= _EDGES * samples.size)
-    total = np.append(0, np.cumsum(counts))
-    side = np.minimum(total[begin], samples.size - total[end])
-    held = (side > _HELD * samples.size) & (end - begin >= _GAP) & (
-        total[end] - total[begin] < _PASSING * side)
-    if not held.any():
+    place = np.floor((samples - low) / (high - low) * _BINS).astype(np.intp)
+    rises = np.flatnonzero(place[1:] > place[:-1])
+    crossed = np.cumsum(np.bincount(place[rises], minlength=_BINS + 1)
+                        - np.bincount(place[rises + 1], minlength=_BINS + 1))
+    below = np.cumsum(np.bincount(place, minlength=_BINS + 1))
+    ends = np.flatnonzero(np.diff(crossed, prepend=-1, append=-1))
+    begin, end = ends[:-1], ends[1:] - 1
+    beyond = np.minimum(below[begin], samples.size - below[end])
+    held = np.flatnonzero(
+        (crossed[begin] > 1) & (end - begin >= _GAP) & (beyond > _HELD * samples.size))
+    if not held.size:
         return None
-    widest = int(np.argmax(np.where(held, end - begin, 0)))
-    beside = StateLevels(float(edges[begin[widest]]), float(edges[end[widest]]), significant=True)
-    modes = _modes(samples)
-    pulses, fewer = (_runs(samples > item.middle)[0].size for item in (modes, beside))
-    clear = _contrast(samples, samples > beside.middle) > 2.0 * _CONTRAST
-    return beside if clear and pulses > fewer > 1 else None
+    widest = max(held, key=lambda k: ((end[k] - begin[k]) // _GAP, -crossed[begin[k]]))
+    edges = low + (np.array([begin[widest], end[widest]]) + 1) * (high - low) / _BINS
+    passed = StateLevels(float(edges[0]), float(edges[1]), significant=True)
+    return passed if _contrast(samples, samples > passed.middle) > 2.0 * _CONTRAST else None
 
 
 def _contrast(samples: FloatArray, upper: BoolArray) -> float:
@@ -244,7 +265,7 @@ def _contrast(samples: FloatArray, upper: BoolArray) -> float:
 
 def _lobes(samples: FloatArray) -> StateLevels | None:
     """Return the levels of pulses with a lobe on either side of the resting level, or None."""
-    low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
+    low, high = _range(samples)
     if not low < high:
         return None
     resting = float(np.median(samples))
