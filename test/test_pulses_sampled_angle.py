@@ -383,6 +383,7 @@ def test_what_was_bridged_is_said():
     (['a'], {}, SignalError, 'give one row of real numbers, in rad or counts'),
     ([[0.0]], {}, SignalError, 'give one row of real numbers, in rad or counts'),
     ([2**60], {}, SignalError, r'above 2\^53 and not exact'),
+    ([0.0, 1024.0], {}, SignalError, 'from 0 to 1024 in whole numbers, not in rad: give integers'),
     ([0.0, 1.0], {}, SignalError, 'give as many times as angles'),
 ])
 def test_unusable_angles_are_refused_in_a_line(angle, options, error, message):

@@ -228,10 +228,9 @@ class KeyphasorDetector:
         if known and not levels.significant:  # larger pulses, perhaps
             levels = state_levels(window, known)
         useful = levels.significant and levels.difference > self._minimum_difference
-        if known and levels.difference < _STOPPED * known.difference and (
-                self._confirmed and not levels.pulsed):
-            useful = False
-        if not useful:
+        stopped = known and self._confirmed and not levels.pulsed and (
+            levels.difference < _STOPPED * known.difference)
+        if stopped or not useful:
             self._levelless += 1
             self._window = [] if known else _last(self._window, window.size // 2)
             return _NONE
@@ -242,11 +241,9 @@ class KeyphasorDetector:
             self._levels = levels
             return np.concatenate([self._detect(piece) for piece in waiting])
         if levels.resembles(known, _DRIFTED):
-            self._pending = None
+            self._pending, self._confirmed = None, True
             if not levels.resembles(known):
                 self._levels = levels
-            if not self._confirmed:
-                self._confirmed = True
         elif not self._confirmed or self._idle(window, known) or (
                 self._pending and levels.resembles(self._pending, _DRIFTED)):
             self._levels, self._pending, self._confirmed = levels, None, False

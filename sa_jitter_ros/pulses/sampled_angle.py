@@ -436,6 +436,9 @@ def pulses_from_angle(
                           'of real numbers, in rad or counts')
     finite = values[np.isfinite(values)].astype(np.float64)
     whole, turn = values.dtype.kind in 'iu', _TURN
+    if not (whole or modulus or np.any(finite % 1.0)) and np.any(np.abs(finite) > _TURN):
+        raise SignalError(f'the angle goes from {finite.min():g} to {finite.max():g} in whole '
+                          'numbers, not in rad: give integers if these are counts, or a modulus')
     if modulus is not None:
         modulus = number('modulus', modulus)
         turn = modulus if modulus.is_integer() and modulus > 0.0 else _TURN
