@@ -32,6 +32,7 @@ from sa_jitter_ros.averaging.shaft_indicators import ShaftIndicators
 from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.averaging.uneven_revolution import lost_inside_revolutions
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
@@ -255,7 +256,9 @@ def average(vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike,
     doubt = likely or other_rate(pulses, start, end, float(sample_rate))
     if discarded:
         warnings.warn(f'{doubt}; {discarded}' if doubt else discarded, DataWarning, stacklevel=2)
-    elif doubt:
+    elif doubt := doubt or values['target_geometry'] == 'none' and lost_inside_revolutions(
+            pulses, averager._stream.shafts[_SHAFT].settings,
+            values['pulses_per_revolution'], values['missing_teeth']):
         warnings.warn(doubt, DataWarning, stacklevel=2)
     if problem := averager.problem:
         warnings.warn(f'no condition indicators: {problem}', DataWarning, stacklevel=2)

@@ -20,6 +20,7 @@ import numpy as np
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
 from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
+from sa_jitter_ros.averaging.uneven_revolution import lost_inside_revolutions
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
@@ -152,13 +153,18 @@ class RecordingAverager:
             self._recording, self.pulses, **target,
             jitter_std=1.0 / math.sqrt(12.0) / rate
             if rate and self._recording.tach is None else None))
+        of_marks = self._values['pulses_per_revolution'], self._values['missing_teeth']
+        if not (self.stream.validator.rejected or self.stream.validator.geometry):
+            found += [lost_inside_revolutions(
+                self.pulses, self.stream.shafts[item.shaft].settings, *of_marks)
+                for item in series]
         weak = []  # a shaft of which the vibration shows nothing is no mistake beside others
         for item in series:
             settings = self.stream.shafts[item.shaft].settings
             weak.append(weak_orders(
                 self._recording, self.pulses, item.orders.tolist(),
                 ratio=settings.cycle_length / settings.revolutions_per_trigger, **target))
-        return (*filter(None, [self._spikes]), *found, *(weak[0] if all(weak) else ()))
+        return (*filter(None, [self._spikes, *found]), *(weak[0] if all(weak) else ()))
 
     def _arrays(self, averages: list[tuple[str, Average]]
                 ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
