@@ -22,17 +22,17 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.evidence import LineEvidence
-from sa_jitter_ros.effects.path_delay import STEADY as STEADY_SPEED
+from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.gathering import cycle_amplitudes, hidden_lines
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
-from sa_jitter_ros.inference.unsteady import STEADY
 from scipy import special
 
 LINES = 'lines'
+_TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
 _NEAR = 1.5  # ratio of frequencies whose power is alike
 _EVENTS = 4.5  # kurtosis; a gain that swings by a third loses cycles, which makes 4
 
@@ -66,7 +66,7 @@ def check_channels(lines: LineEvidence) -> Check:
         parts = [lines.channel == name, lines.channel != name]
         own, others = (means[:, part] @ weight[part] / weight[part].sum() for part in parts)
         apart, freedom = own - others, len(own) - 1
-        noise = sum(1.0 / weight[part].sum() for part in parts) + STEADY**2
+        noise = sum(1.0 / weight[part].sum() for part in parts) + _TURN**2
         size = float(np.std(apart, ddof=1))
         checks.append(Check(
             min(1.0, float(special.chdtrc(freedom, freedom * size**2 / noise)) * names.size),
@@ -179,7 +179,7 @@ def _turns(observation: Observation, ratio: Array, noise: Array, order: Array, f
     freedom = max(freedom - 1, 1)  # of the acceleration
     power = np.sum(ratio.imag**2, axis=0) / freedom
     own = np.sqrt(np.maximum(power - noise**2, 0.0))
-    chance = special.chdtrc(freedom, freedom * power / (noise**2 + STEADY**2))
+    chance = special.chdtrc(freedom, freedom * power / (noise**2 + _TURN**2))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
                  f'the phase of {observation.words(order[worst])} changes by {own[worst]:.2g} '
@@ -219,14 +219,14 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
     speed = speed / speed.mean() - 1.0
     spread = float(np.std(speed))
     freedom = speed.size - 4  # of the parabola and the acceleration
-    if freedom < 1 or spread < STEADY_SPEED:
+    if freedom < 1 or spread < STEADY:
         return ()
     shape = np.stack([np.ones(speed.size), speed / spread, (speed / spread) ** 2], axis=1)
     fitted = shape @ np.linalg.lstsq(shape, size, rcond=None)[0]
     total, left = np.var(size, axis=0), np.mean((size - fitted) ** 2, axis=0)
     explained = total - left
     worst = int(np.argmax(explained / noise**2))
-    if not explained[worst] > STEADY**2:
+    if not explained[worst] > _TURN**2:
         return ()
     ratio = (total[worst] - left[worst]) / 2.0 / (left[worst] / freedom)
     return (Check(float(special.fdtrc(2, freedom, ratio)) * size.shape[1], LINES,

@@ -25,8 +25,8 @@ from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.number_text import percent_text
 from scipy import special
 
-#: Relative scatter of an amplitude, or rad of its phase, from average to average that steady
-#: machines were measured to have and that no effect describes (docs/measured_cases.md).
+#: Relative scatter of an amplitude from average to average that steady machines were measured to
+#: have and that no effect describes (docs/measured_cases.md).
 STEADY = 0.02
 #: The same of ordinary machines (6 % on a bearing rig): beyond it, the machine is unexplained.
 ORDINARY = 0.07
