@@ -26,17 +26,15 @@ from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.line_search import least_seen
-from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
+from sa_jitter_ros.inference.observation import (
+    Acquisition, CHANCE, Observation, recovered_again, STRONG)
 from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.prediction.influence import AveragePulses, known_errors, without_gaps
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-#: Of its order's strongest channel, from which on a line is worth comparing.
-STRONG = 0.2
 _COHERENT = 0.9
 _GROUPS = 3
-_LAGS = 5  # at which errors on the ticks of a clock depend on each other, where they do
 
 
 @dataclass(frozen=True)
@@ -150,8 +148,7 @@ def clock_of(observation: Observation) -> tuple[Clock, Array | None]:
         return Clock(0.0, 0.0), None
     smooth = smooth_on_grid(times, clock.rate)
     share = _confirmed(observation, smooth)
-    unidentifiable = share < 1.0 - SLOPE_OFF and _independent(observation)
-    if unidentifiable or dithered(observation, clock, smooth):
+    if share < 1.0 - SLOPE_OFF or dithered(observation, clock, smooth):
         return replace(clock, dithered=True), None
     return clock, min(max(share, 0.0), 1.0) * smooth
 
@@ -169,21 +166,6 @@ def _confirmed(observation: Observation, smooth: Array) -> float:
     errors = _straightened(np.array([item.errors for item in usable]))
     power = float(np.sum(imposed**2))
     return float(np.sum(imposed * errors) / power) if power else 1.0
-
-
-def _independent(observation: Observation) -> bool:
-    """Return whether recovered errors are independent from pulse to pulse, as far as they tell."""
-    usable = [item.errors for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
-    if not usable or usable[0].size <= _LAGS + 1:
-        return False
-    errors = _straightened(np.array(usable))
-    power = float(np.mean(errors**2))
-    if not power > 0.0:
-        return False
-    together = np.array([np.mean(errors[:, lag:] * errors[:, :-lag]) for lag in range(
-        1, _LAGS + 1)]) / power
-    chance = special.ndtri(1.0 - 0.5 * FALSE_ALARM / _LAGS)
-    return bool(np.all(np.abs(together) * math.sqrt(errors.size) < chance))
 
 
 def _straightened(errors: Array) -> Array:
