@@ -35,7 +35,7 @@ from scipy.special import gammaincc
 
 Array = NDArray[np.float64]
 
-_MOST_LINES = 60  # undeclared ones
+_MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
 # A line is not far below the strongest, which may leave images of itself.
 _SHARE = 0.3
 _HANN = 1.5  # bins of noise in one of the window
@@ -130,7 +130,7 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
     found.sort(reverse=True)
     orders: list[float] = []
     tones: list[float] = []
-    room = _MOST_LINES - states.lines_found
+    room = _MOST_LINES // (1 if states.all_free else 2) - states.lines_found
     least_power = 0.0
     for size, place, tone in found:
         if size < least_power or len(orders) + len(tones) >= room:

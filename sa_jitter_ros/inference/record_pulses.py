@@ -25,10 +25,11 @@ from sa_jitter_ros.recordings.recording import Recording
 SPEED_TOLERANCE = 0.1
 _SPEEDS = 0.05  # share of the cycles that are faster than the speeds of a run-up, and slower
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
-_MOST = 0.5  # of the pulses: a shaft drops fewer, and a reference keyphasor covers more
+_MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
 _USUAL = 15  # pulses before a gap that tell how many it hides
+_COVERED = 0.5  # of the pulses, by those of a reference keyphasor
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
                              f'{_MOST_SPURIOUS:.0%}: give the trigger more hysteresis')
     dropped = spurious + counts.unlocked
-    if dropped > _MOST * measured.size:
+    if dropped > _MOST_DROPPED * measured.size:
         raise RecordingError(f'{dropped} of {measured.size} pulses follow each other at no '
                              'interval that a shaft could have: see what check_keyphasor finds in '
                              'them')
@@ -243,9 +244,9 @@ def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArra
     matched = np.full(wanted.size, np.nan)
     matched[inside] = known[wanted[inside]]
     share = float(np.mean(np.isfinite(matched[pulses.number])))
-    if share < _MOST:
+    if share < _COVERED:
         raise RecordingError(f'reference_pulse_times cover {share:.0%} of the pulses, at least '
-                             f'{_MOST:.0%} are needed: give pulses of the same period of time')
+                             f'{_COVERED:.0%} are needed: give pulses of the same period of time')
     return matched
 
 
