@@ -35,6 +35,7 @@ from scipy import special
 
 _COHERENT = 0.9
 _GROUPS = 3
+_LAGS = 5  # at which errors on the ticks of a clock depend on each other, where they do
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,8 @@ def clock_of(observation: Observation) -> tuple[Clock, Array | None]:
         return Clock(0.0, 0.0), None
     smooth = smooth_on_grid(times, clock.rate)
     share = _confirmed(observation, smooth)
-    if share < 1.0 - SLOPE_OFF or dithered(observation, clock, smooth):
+    unidentifiable = share < 1.0 - SLOPE_OFF and _independent(observation)
+    if unidentifiable or dithered(observation, clock, smooth):
         return replace(clock, dithered=True), None
     return clock, min(max(share, 0.0), 1.0) * smooth
 
@@ -166,6 +168,21 @@ def _confirmed(observation: Observation, smooth: Array) -> float:
     errors = _straightened(np.array([item.errors for item in usable]))
     power = float(np.sum(imposed**2))
     return float(np.sum(imposed * errors) / power) if power else 1.0
+
+
+def _independent(observation: Observation) -> bool:
+    """Return whether recovered errors are independent from pulse to pulse, as far as they tell."""
+    usable = [item.errors for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
+    if not usable or usable[0].size <= _LAGS + 1:
+        return False
+    errors = _straightened(np.array(usable))
+    power = float(np.mean(errors**2))
+    if not power > 0.0:
+        return False
+    together = np.array([np.mean(errors[:, lag:] * errors[:, :-lag]) for lag in range(
+        1, _LAGS + 1)]) / power
+    chance = special.ndtri(1.0 - 0.5 * FALSE_ALARM / _LAGS)
+    return bool(np.all(np.abs(together) * math.sqrt(errors.size) < chance))
 
 
 def _straightened(errors: Array) -> Array:
