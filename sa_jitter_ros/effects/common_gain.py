@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import ONE_SIDED
+from sa_jitter_ros.effects.timing import LARGE
 from scipy.optimize import minimize
 
 _LEAST = 0.1  # of the noise: what a line changes by itself at least
-_RANGE = 25.0  # of logarithms of a power
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _shared(power: Array, count: float, gain: Array) -> tuple[float, float, floa
         return count * float(value), count * np.append(by_own, by_size)
 
     first = np.append(np.log(np.maximum(each - gain**2 * start, 0.5 * alone)), np.log(start))
-    bounds = [*[(np.log(_LEAST), _RANGE)] * gain.size, (-_RANGE, _RANGE)]
+    bounds = [*[(np.log(_LEAST), LARGE)] * gain.size, (-LARGE, LARGE)]
     found = minimize(cost, first, method='L-BFGS-B', jac=True, bounds=bounds)
     own, size = np.exp(found.x[:-1]), float(np.exp(found.x[-1]))
     without = count * float(np.sum(np.log(alone) + each / alone))

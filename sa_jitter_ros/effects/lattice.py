@@ -26,8 +26,8 @@ ROOM = 0.02
 #: What the slope of errors over those of the smoothest motion on a grid may be off by.
 SLOPE_OFF = 0.25
 _STEPS = 3000
-# Least difference of intervals: in parts of the largest, and s; ticks by which equal ones differ.
-_LEAST_GAP, _LEAST_TICK, _SAME = 1e-3, 1e-12, 0.05
+# Least difference of intervals, in parts of the largest; ticks by which equal ones differ.
+_LEAST_GAP, _SAME = 1e-3, 0.05
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def find_clock(times: Array) -> Clock:
     """
     intervals = np.sort(np.diff(times))
     gaps = np.diff(intervals[intervals < 1.5 * np.median(intervals)])
-    grid = find_grid(times, rounding(times), max(
-        _LEAST_GAP * float(np.max(gaps, initial=0.0)), _LEAST_TICK))
+    least = rounding(times)
+    grid = find_grid(times, least, max(_LEAST_GAP * float(np.max(gaps, initial=0.0)), least))
     if grid is None or np.count_nonzero(gaps <= _SAME * grid.tick) < 0.5 * gaps.size:
         return NO_CLOCK
     return Clock(1.0 / grid.tick, grid.standard_error / grid.tick**2)

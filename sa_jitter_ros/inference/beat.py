@@ -28,7 +28,6 @@ from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
 METHODS = ('linear', 'cubic', 'spline')
-_KNOWN = 0.03  # error of the shape
 _HARMONICS = 4  # of the beat
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
 
@@ -58,7 +57,6 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
     noise *= np.maximum(median_filter(together, _AROUND) / np.log(2.0), 1.0)[:, None]
     turns = np.arange(8, 8 + len(spectrum)) / (4 * count)
     depth_left = np.sinc(turns)[:, None]  # of the mean over a trigger cycle
-    shown = np.abs(swings) ** 2 / noise
     tried = np.log(count)
     alone = [_of_sidebands(swings[:, own], noise[:, own]) - tried
              for own in order == np.unique(order)[:, None]]
@@ -70,17 +68,13 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
         below, mean, above = (interpolator_gain(method, frequency + k) for k in (-1.0, 0.0, 1.0))
         swing = np.abs(below + above)
         wanted = depth_left * swing / mean
-        unsure = noise + (_KNOWN * wanted) ** 2
-        along = 2.0 * np.abs(np.sum(swings * wanted / unsure, axis=1))
+        along = 2.0 * np.abs(np.sum(swings * wanted / noise, axis=1))
         likelihood = along - 0.5 * np.log1p(2.0 * np.pi * along) + np.sum(  # of any phase
-            shown - (np.abs(swings) ** 2 + wanted**2) / unsure - np.log(unsure / noise), axis=1)
+            -(wanted**2) / noise, axis=1)
         peak = int(np.argmax(likelihood - rival))
         if likelihood[peak] - rival[peak] > best:
             best = likelihood[peak] - rival[peak]
-            # The shape is known to so much, what a line shows by its own noise.
-            share = (_KNOWN * wanted[peak]) ** 2 / unsure[peak]
-            off = np.clip(np.abs(swings[peak]) / wanted[peak] - 1.0, -0.5, 0.5)
-            name, at, kept = method, peak, 1.0 - (1.0 - mean) * (1.0 + share * off)
+            name, at, kept = method, peak, mean
     peaks = int(np.count_nonzero((rival[1:-1] > ODDS) & (rival[1:-1] > rival[:-2])
                                  & (rival[1:-1] >= rival[2:])))
     # each method, and each line that stands there by itself and may look like a beat

@@ -28,11 +28,10 @@ from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-# Cycles on either side whose mean phasors are compared, most and fewest, and of a sudden change.
-_BESIDE, _FEWEST, _SUDDEN = 24, 8, 4
+# Cycles on either side whose mean phasors are compared, most and fewest.
+_BESIDE, _FEWEST = 24, 8
 # Standard deviations of the contrasts of a record from which on one is a step: drifts make 5.
 _CLEAR = 8.0
-_MOST = 50  # steps of a record
 _FINE = 10  # times that are tried, in a period of the highest order
 _EVEN = 0.995  # likelihoods, over the best one, that are as good: then the smallest step counts
 _CHUNK = 500  # cycles read at once
@@ -69,7 +68,7 @@ def clock_steps(reader: CycleReader, pulses: RecordPulses, stretches: Sequence[s
     for part in stretches:
         phasors = _Phasors.read(reader, pulses.bridged[part], model)
         edges = [0, phasors.count]
-        while len(found) < _MOST and (step := _clearest(phasors, edges)) is not None:
+        while (step := _clearest(phasors, edges)) is not None:
             at, size, error, period = step
             pulse = part.start + at + 1  # the step is inside cycle `at`
             found.append(ClockStep(pulse, float(np.mean(pulses.bridged[pulse - 1:pulse + 1])),
@@ -200,7 +199,7 @@ def _clearest(phasors: _Phasors,
         edge for edge in edges if edge > at)
     sides = (max(first, at - 2 * _BESIDE), at), (at + 1, min(last, at + 1 + 2 * _BESIDE))
     size = phasors.delay(*sides) - usual
-    sudden = all(phasors.likelihood(at, _SUDDEN, size + usual) > phasors.likelihood(
-        at, _SUDDEN, part * size + usual) for part in (0.0, 0.5))
+    sudden = all(phasors.likelihood(at, _FEWEST, size + usual) > phasors.likelihood(
+        at, _FEWEST, part * size + usual) for part in (0.0, 0.5))
     clear = sudden and abs(size) > _CLEAR * error
     return (at, size, error, phasors.period(*sides)) if clear else None

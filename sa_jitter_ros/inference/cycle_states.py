@@ -41,10 +41,9 @@ from scipy.linalg import cho_solve
 Array = NDArray[np.float64]
 
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
-# Bends in parts of the declared jitter, and gains: a first guess when they become free, and the
-# least that they keep always: a bend of nothing would be certain.
-_FREE, _LEAST_BEND, _LEAST_GAIN = 0.1, 0.003, 1e-3
-_LEAST_JITTER = 0.1  # of the declared one
+# Errors and bends in parts of the declared jitter, and gains: a first guess of bends and gains
+# when they become free, and the least that all keep always: a bend of nothing would be certain.
+_FREE, _LEAST = 0.1, 1e-3
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
 
@@ -83,7 +82,7 @@ class States:
                                 np.ones(points), u])
         self.width = len(self.shapes) - 1
         self.states = np.zeros((times.size, self.width))
-        self.least = np.array([*[_LEAST_BEND * jitter_std] * (self.width - 2), _LEAST_GAIN])
+        self.least = _LEAST * np.array([*[jitter_std] * (self.width - 2), 1.0])
         self.size = np.append(jitter_std, self.least)
         self.all_free = self.converged = False
         self.resolved = np.zeros(self.width)
@@ -402,7 +401,7 @@ class States:
         errors = (self.states[:, 0] - self.no_jitter)[inner]
         power, more = self._estimated(0, errors - errors.mean(),
                                       1.0 - 1.0 / np.count_nonzero(self.measured))
-        power = max(power, min(more, self.most_power), (_LEAST_JITTER * self.jitter_std) ** 2)
+        power = max(power, min(more, self.most_power), (_LEAST * self.jitter_std) ** 2)
         self.size[0] = np.sqrt(power)
         if self.all_free:
             for i, least in enumerate(self.least, start=1):

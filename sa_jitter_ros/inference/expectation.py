@@ -29,6 +29,7 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.inference.cycle_reader import kept_apart
 from sa_jitter_ros.inference.observation import Acquisition, Observation
+from sa_jitter_ros.inference.order_band import BEYOND_LINES
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.amplitudes import (
     Amplitudes, component_gain, known_amplitudes, line_variance, unit_amplitudes)
@@ -52,8 +53,6 @@ _PLACES = 12  # in a cycle, where errors turn hardly
 _MANY_VALUES, _ENOUGH, _MOST_VALUES = 200_000, 4096, 1_000_000
 # Speeds closer than this are the same: no amplitude changes by more than 1e-3.
 _SPEED_STEP = 2e-3
-_SHARPEST = 2.0
-_NEAR = 3.0  # lines of a trigger cycle: sources further away hardly leak by random errors
 
 
 @dataclass(frozen=True)
@@ -366,10 +365,10 @@ def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
     Return the factor that corrects moments for the uncertainty `doubt` of the known errors.
 
     Uncertain errors scatter more than the true ones, so that they attenuate too much; the
-    uncertainty itself attenuates once more. The factor is at most two.
+    uncertainty itself attenuates once more.
     """
     mean = np.abs(cycle_moments(orders, [doubt], nodes=_NODES, lags=0).mean)
-    return np.asarray(np.minimum(mean**-2.0, _SHARPEST))
+    return np.asarray(mean**-2.0)
 
 
 @lru_cache(maxsize=8)
@@ -460,7 +459,7 @@ def _scatter(observation: Observation, processes: Sequence[AngleErrorProcess]) -
         joint = joint_characteristic(processes, [each, -each], [u[:, None], u], [0, lag]) - both
         pair = np.sum((waves @ joint) * waves.conj(), axis=-1) * np.exp(-2j * np.pi * turns * lag)
         found += (1.0 if lag == 0 else 2.0) * (count - lag) / count**2 * pair.real
-    found[(np.abs(turns) >= _NEAR) | (sources[:, None] == observation.orders)] = 0.0
+    found[(np.abs(turns) >= BEYOND_LINES) | (sources[:, None] == observation.orders)] = 0.0
     return np.asarray(np.maximum(found.T, 0.0))
 
 

@@ -26,14 +26,13 @@ from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.line_search import least_seen
-from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
+from sa_jitter_ros.inference.observation import (
+    Acquisition, CHANCE, Observation, recovered_again, STRONG)
 from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.prediction.influence import AveragePulses, known_errors, without_gaps
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-#: Of its order's strongest channel, from which on a line is worth comparing.
-STRONG = 0.2
 _COHERENT = 0.9
 _GROUPS = 3
 _LAGS = 5  # at which errors on the ticks of a clock depend on each other, where they do

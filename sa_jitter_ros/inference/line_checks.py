@@ -26,16 +26,15 @@ from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.gathering import cycle_amplitudes, hidden_lines
 from sa_jitter_ros.inference.observation import Observation
+from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
 from scipy import special
 
 LINES = 'lines'
 _TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
-_LOSS = 0.14  # rad by which a line that turns in each cycle loses 1 % of its average
 _NEAR = 1.5  # ratio of frequencies whose power is alike
 _EVENTS = 4.5  # kurtosis; a gain that swings by a third loses cycles, which makes 4
-_FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
 
 
 def check_gain(lines: LineEvidence) -> Check:
@@ -206,7 +205,8 @@ def _turns_in_cycles(observation: Observation, lines: Lines) -> Check:
     power = np.mean(turn**2, axis=(0, 1))
     freedom = len(cycles) * (cycles.shape[1] - 1)
     own = np.sqrt(np.maximum(power - noise, 0.0))
-    chance = special.fdtrc(freedom, freedom, power / (noise + _LOSS**2))
+    # a line that turns by x rad in each cycle loses x^2 / 2 of its average
+    chance = special.fdtrc(freedom, freedom, power / (noise + 2.0 * NOTICEABLE))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
                  f'the phase of {observation.words(order[worst])} changes by {own[worst]:.2g} '
@@ -224,7 +224,7 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
     shape = np.stack([np.ones(speed.size), speed / spread, (speed / spread) ** 2], axis=1)
     fitted = shape @ np.linalg.lstsq(shape, size, rcond=None)[0]
     total, left = np.var(size, axis=0), np.mean((size - fitted) ** 2, axis=0)
-    explained = np.where(total - left > _FOLLOWS * total, total - left, 0.0)
+    explained = total - left
     worst = int(np.argmax(explained / noise**2))
     if not explained[worst] > _TURN**2:
         return ()

@@ -52,6 +52,8 @@ NameOf = Callable[[float], str]  # of an order
 
 #: Coherence of a line from cycle to cycle, in units of that of noise, from which on it is used.
 CHANCE = 4
+#: Of the strongest channel's amplitude of an order, from which on a line is worth comparing.
+STRONG = 0.2
 _OTHER_MACHINE = 5.0
 _LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
 # A ripple with more than this many times the power of its noise is corrected.
@@ -273,7 +275,7 @@ def together(observations: Sequence[Observation]) -> Observation:
             raise ModelError(f'recordings {first.name!r} and {other.name!r} differ in sample '
                              'rate, channels or reference keyphasor: run the loop on each alone')
         ratio = np.abs(other.stacked('corrected')).mean(axis=0) / level
-        strong = level > 0.2 * level.max()
+        strong = level > STRONG * level.max()
         if not np.all((ratio[strong] > 1.0 / _OTHER_MACHINE) & (ratio[strong] < _OTHER_MACHINE)):
             raise ModelError(f'recordings {first.name!r} and {other.name!r} have amplitudes that '
                              f'differ by more than a factor of {_OTHER_MACHINE:g}: these are '

@@ -20,7 +20,7 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.cycle import exact_cycles
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import RESOLUTION
-from sa_jitter_ros.inference.gathering import STRONG
+from sa_jitter_ros.inference.observation import STRONG
 from sa_jitter_ros.inference.record_pulses import SPEED_TOLERANCE
 from sa_jitter_ros.inference.residual import Residual, residual
 from sa_jitter_ros.prediction.model import DeclaredModel

@@ -26,6 +26,7 @@ from functools import lru_cache
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.effects.timing import ROUNDING
+from sa_jitter_ros.inference.cycle_reader import MARGIN
 from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.order_band import band_end
 from sa_jitter_ros.inference.record_fit import OpenRecord, RecordFit
@@ -34,7 +35,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from scipy import special
 
-_EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
@@ -130,7 +130,7 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
                 lines = fit.orders[len(model.orders):], fit.tones
         return found
 
-    stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, _EDGE / rate)
+    stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, MARGIN / rate)
     wider = 1.0
     recovery = _joined(pulses, stretches, fits(known, wider))
     if not recovery.resolved and ends(_WIDER) != ends(wider):
@@ -180,8 +180,8 @@ def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     times = pulses.bridged[stretch]
     measured = np.zeros(pulses.bridged.size, np.bool_)
     measured[pulses.number[~pulses.doubtful]] = True
-    first = max(int((times[0] - start_time) * rate) - _EDGE, 0)
-    last = int((times[-1] - start_time) * rate) + _EDGE
+    first = max(int((times[0] - start_time) * rate) - MARGIN, 0)
+    last = int((times[-1] - start_time) * rate) + MARGIN
     part = samples[first:last + 1]
     part = part[:, np.ptp(part, axis=0) > np.maximum(
         ROUNDING * np.abs(part).max(axis=0), LEAST_RANGE)]

@@ -25,6 +25,8 @@ from scipy import special
 
 #: Accuracy of a predicted attenuation: smaller residuals do not change the verdict.
 ACCURACY = 3e-3
+#: Change of an average from which on it matters what else may be there.
+NOTICEABLE = 1e-2
 #: Accuracy of the difference of two predictions for the same lines at the same speed.
 ACCURACY_OF_CHANGE = 1e-3
 #: Chance of one kind of false alarm: that something is left where the model is right.

@@ -44,7 +44,7 @@ from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
 from sa_jitter_ros.inference.residual import ACCURACY
-from sa_jitter_ros.inference.timing_checks import Check, check_timing
+from sa_jitter_ros.inference.timing_checks import BESIDE, Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
 from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, SteadyTorsion, Stretch
@@ -55,9 +55,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
-_RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
-_BESIDE = 12  # ordinates on either side of a sinusoid, of which the noise is told
-_REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
 
 @dataclass(frozen=True)
@@ -120,7 +117,7 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
     # where the vibration resolves the errors, it shows more than the reference keyphasor does
     resolved = np.median(np.concatenate([
         item.standard_errors for item in observation.recoveries]))
-    reference = None if resolved < _RESOLVED * unit else observation.pulses.reference
+    reference = None if resolved < RESOLVED * unit else observation.pulses.reference
     for number, first, last in _runs(observation, chosen):
         recovery = observation.recoveries[number]
         numbers = recovery.pulses.number
@@ -201,7 +198,7 @@ def _bends_of_motion(times: Array, frequency: Array) -> tuple[Array, Array, Arra
     """
     second = np.diff(times, 2)
     window, turns = hann(second.size), -2j * np.pi * np.arange(second.size)
-    beside = np.array([0, *range(-_BESIDE, -2), *range(3, _BESIDE + 1)]) / second.size
+    beside = np.array([0, *range(-BESIDE, -2), *range(3, BESIDE + 1)]) / second.size
     size = np.array([np.abs(np.exp(np.multiply.outer(place + beside, turns)) @ (window * second))
                      for place in frequency]).reshape(-1, beside.size)
     count = beside.size // 4  # neighbours in the window are not independent
@@ -261,7 +258,7 @@ def _stretch(model: DeclaredModel, recovery: RecordRecovery, part: slice, here: 
         measured = measured & known
         errors = np.where(known, bridged - better, 0.0)
         errors = errors - errors[measured].mean()
-        error_std, prior = _REFERENCE * unit, math.inf
+        error_std, prior = 0.0, math.inf
         bend_std = math.inf  # what shows no errors shows no bends
     grid = None
     if imposed is not None:

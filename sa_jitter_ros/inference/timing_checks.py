@@ -22,6 +22,7 @@ import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.effects.timing import MOTION, PULSES, SOURCE
+from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser, SIDEBANDS
 from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
@@ -31,8 +32,8 @@ _DECLARED, _SCALED, _TICKS = 'declared', 'scaled', 'ticks'
 #: Draws of what is there by chance, and their seed.
 DRAWS, SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
-_SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
-_BESIDE = 8  # frequencies on either side of a sinusoid that show what is there without it
+#: Frequencies on either side of a sinusoid that show what is there without it.
+BESIDE = 8
 _FEWEST = 40  # pulses whose distribution is looked at
 _FEW_VALUES = 12.0  # six swings, below which a random motion is not told from a drift
 _TAIL = 0.1  # share of the draws that are their tail
@@ -114,7 +115,7 @@ def _narrow(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid stands out of a random motion whose spectrum nobody knows."""
     size, unit = _waves(fit, inverse, direction)
     count = len(fit.data.lengths)  # ordinates of each frequency
-    near, far = 3 * count, (3 + _BESIDE) * count
+    near, far = 3 * count, (3 + BESIDE) * count
     place, sums = np.arange(size.size), np.append(0.0, np.cumsum(size))
     ends = np.clip([place - far + 1, place - near + 1, place + near, place + far], 0, size.size)
     beside = sums[ends[1]] - sums[ends[0]] + sums[ends[3]] - sums[ends[2]]
@@ -137,7 +138,8 @@ def _highest(fit: TimingFit, inverse: Array, direction: str, size: Array, unit: 
              by_chance: Array) -> Check:
     """Return the test of the sinusoid that is there least `by_chance` (ordinate,)."""
     data, frequency = fit.data, fit.data.each
-    tried = (frequency > _SLOWEST / data.longest) & _identifiable(fit, inverse)[data.bin]
+    # slower ones are a drift
+    tried = (frequency > APART / data.longest) & _identifiable(fit, inverse)[data.bin]
     top = int(np.argmin(np.where(tried, by_chance, 2.0)))
     count = int(np.count_nonzero(tried))
     return Check(-math.expm1(count * math.log1p(-min(float(by_chance[top]), 1.0 - 1e-9))),

@@ -28,9 +28,8 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import recovered, recovered_shapes
 from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
 
-_NEXT = 1
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
-ALIASES = np.array([0, _NEXT, -_NEXT])
+ALIASES = np.array([0, 1, -1])
 #: Share of a series, at either end, over which a `taper` rises or falls.
 TAPER = 0.05
 _BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one

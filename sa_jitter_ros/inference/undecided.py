@@ -21,12 +21,12 @@ from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.limits import EffectLimit
 from sa_jitter_ros.inference.observation import Observation
+from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.prediction.prediction import predict
 
 #: The largest change that an effect beside others makes.
 Change = Callable[[Sequence[Effect], Effect], float]
-_UNDECIDED = 1e-2  # change of an average by what may be there
 # Shares of effects that are there, in the open half of the table of decisions.
 _NAMED, _NOT_NAMED, _NOWHERE = 0.98, 0.02, 7e-4
 
@@ -50,7 +50,7 @@ def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[
             size = change(effects, row.effect)
         except ModelError:  # so large that no average is left
             size = math.inf
-        if size >= _UNDECIDED:
+        if size >= NOTICEABLE:
             found.append(row.name)
     return tuple(found)
 
