@@ -256,10 +256,12 @@ def average(vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike,
     doubt = likely or other_rate(pulses, start, end, float(sample_rate))
     if discarded:
         warnings.warn(f'{doubt}; {discarded}' if doubt else discarded, DataWarning, stacklevel=2)
-    elif doubt := doubt or values['target_geometry'] == 'none' and lost_inside_revolutions(
-            pulses, averager._stream.shafts[_SHAFT].settings,
-            values['pulses_per_revolution'], values['missing_teeth']):
+    elif doubt:
         warnings.warn(doubt, DataWarning, stacklevel=2)
+    elif values['target_geometry'] == 'none' and (lost := lost_inside_revolutions(
+            pulses, averager._stream.shafts[_SHAFT].settings,
+            values['pulses_per_revolution'], values['missing_teeth'])):
+        warnings.warn(lost, DataWarning, stacklevel=2)
     if problem := averager.problem:
         warnings.warn(f'no condition indicators: {problem}', DataWarning, stacklevel=2)
     refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
