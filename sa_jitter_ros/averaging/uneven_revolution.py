@@ -51,7 +51,7 @@ def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
     worst = int(np.argmax(lost))
     if lost[worst] < _LOSS:
         return ''
-    return (f'marks come up to {np.ptp(off):.1%} of a revolution early or late in each of them: '
+    return (f'in each revolution marks come up to {np.ptp(off):.1%} of it early or late: '
             f'if the speed changes inside revolutions, order {orders[worst]:g} may lose '
             f'{min(lost[worst], 1.0):.0%} of its amplitude, which pulses_per_trigger 1 keeps '
             '(trigger_cycles then counts marks); if the marks stand unevenly, nothing is lost: '
