@@ -16,9 +16,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.inference.expectation import _leakage, expect, Lines, RESOLUTION
+from sa_jitter_ros.inference.expectation import (
+    _leakage, _sharpening, expect, Lines, RESOLUTION)
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_pulses import RecordPulses
+from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
+from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import AveragePulses, Influence, random_processes
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
@@ -232,3 +235,9 @@ def test_mirror_images_far_away_do_not_leak():
     images = found[:, 3:5]  # of the two orders
     assert np.abs(images).max() < 1e-3
     assert np.abs(found[0, 0]) > 0.9
+
+
+@pytest.mark.parametrize('blur', [1e-9, 1e-3, 1.0, 1e3])
+def test_uncertain_errors_sharpen_moments_at_most_twice(blur):
+    factor = _sharpening(np.array([1e-3, 1.0, 30.0, 1e5]), IndependentPulseJitter(Normal(blur)))
+    assert np.all((factor >= 1.0 - 1e-12) & (factor <= 2.0))

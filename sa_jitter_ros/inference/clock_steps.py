@@ -32,6 +32,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 _BESIDE, _FEWEST = 24, 8
 # Standard deviations of the contrasts of a record from which on one is a step: drifts make 5.
 _CLEAR = 8.0
+_MOST = 50  # steps of a record
 _FINE = 10  # times that are tried, in a period of the highest order
 _EVEN = 0.995  # likelihoods, over the best one, that are as good: then the smallest step counts
 _CHUNK = 500  # cycles read at once
@@ -68,7 +69,7 @@ def clock_steps(reader: CycleReader, pulses: RecordPulses, stretches: Sequence[s
     for part in stretches:
         phasors = _Phasors.read(reader, pulses.bridged[part], model)
         edges = [0, phasors.count]
-        while (step := _clearest(phasors, edges)) is not None:
+        while len(found) < _MOST and (step := _clearest(phasors, edges)) is not None:
             at, size, error, period = step
             pulse = part.start + at + 1  # the step is inside cycle `at`
             found.append(ClockStep(pulse, float(np.mean(pulses.bridged[pulse - 1:pulse + 1])),

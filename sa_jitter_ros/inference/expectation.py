@@ -53,6 +53,7 @@ _PLACES = 12  # in a cycle, where errors turn hardly
 _MANY_VALUES, _ENOUGH, _MOST_VALUES = 200_000, 4096, 1_000_000
 # Speeds closer than this are the same: no amplitude changes by more than 1e-3.
 _SPEED_STEP = 2e-3
+_SHARPEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -365,10 +366,10 @@ def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
     Return the factor that corrects moments for the uncertainty `doubt` of the known errors.
 
     Uncertain errors scatter more than the true ones, so that they attenuate too much; the
-    uncertainty itself attenuates once more.
+    uncertainty itself attenuates once more. The factor is at most two.
     """
     mean = np.abs(cycle_moments(orders, [doubt], nodes=_NODES, lags=0).mean)
-    return np.asarray(mean**-2.0)
+    return np.asarray(1.0 / np.maximum(mean**2, 1.0 / _SHARPEST))
 
 
 @lru_cache(maxsize=8)
