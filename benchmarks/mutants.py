@@ -55,10 +55,11 @@ Answer = dict[str, str]
 
 @dataclass(frozen=True)
 class Fault:
-    """A change of the source: where it stands, what it replaces, and the names of its constant."""
+    """A change of the source: its line, what it replaces there, and the names of its constant."""
 
     path: str
     line: int
+    text: str
     start: int
     end: int
     before: str
@@ -71,11 +72,6 @@ class Fault:
         return f'{self.path}: {self.text.strip()}: {self.before} -> {self.after} @{self.start}'
 
     @property
-    def text(self) -> str:
-        """Return the line as it is."""
-        return Path(ROOT, self.path).read_text().splitlines()[self.line - 1]
-
-    @property
     def changed(self) -> str:
         """Return the line with the fault."""
         return self.text[:self.start] + self.after + self.text[self.end:]
@@ -86,6 +82,7 @@ def faults() -> Iterator[Fault]:
     for room in ROOMS:
         for path in sorted(Path(ROOT, 'sa_jitter_ros', room).glob('*.py')):
             source = path.read_text()
+            lines = source.splitlines()
             for top in ast.parse(source).body:
                 if isinstance(top, (ast.Import, ast.ImportFrom)):
                     continue
@@ -94,14 +91,15 @@ def faults() -> Iterator[Fault]:
                         item.id for item in ast.walk(top)
                         if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store))
                 for node in ast.walk(top):
-                    found = _fault(node, source)
+                    found = _fault(node, lines)
                     if found is not None:
                         line, start, end, after = found
-                        yield Fault(str(path.relative_to(ROOT)), line, start, end,
-                                    source.splitlines()[line - 1][start:end], after, constants)
+                        text = lines[line - 1]
+                        yield Fault(str(path.relative_to(ROOT)), line, text, start, end,
+                                    text[start:end], after, constants)
 
 
-def _fault(node: ast.AST, source: str) -> tuple[int, int, int, str] | None:
+def _fault(node: ast.AST, lines: Sequence[str]) -> tuple[int, int, int, str] | None:
     """Return line, columns and text of the fault of a node; None if it has none."""
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         assert node.end_col_offset is not None
@@ -110,7 +108,7 @@ def _fault(node: ast.AST, source: str) -> tuple[int, int, int, str] | None:
         left, right = node.left, node.comparators[0]
         if left.end_lineno == right.lineno:
             assert left.end_col_offset is not None
-            between = source.splitlines()[right.lineno - 1][left.end_col_offset:right.col_offset]
+            between = lines[right.lineno - 1][left.end_col_offset:right.col_offset]
             sign = between.strip(' ()')
             start = left.end_col_offset + between.index(sign)
             return right.lineno, start, start + len(sign), _OPPOSITE[type(node.ops[0])]

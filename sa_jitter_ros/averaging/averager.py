@@ -42,7 +42,6 @@ from sa_jitter_ros.samples import SampleBlock
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-
 _PIECE = 1 << 18  # samples of a channel that are handed on at once, so that memory stays small
 _ALL_CYCLES = 1 << 60  # more trigger cycles than a stream has
 _SHAFT = 'shaft'

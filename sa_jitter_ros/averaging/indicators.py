@@ -231,7 +231,10 @@ def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
     >>> float(signals.amplitudes[7].round(3))
     0.1
     """
-    samples = _checked(average)
+    return _separated(_checked(average), settings)
+
+
+def _separated(samples: Array, settings: GearSettings) -> GearSignals:
     points = samples.shape[-1]
     lines = gear_lines(settings, points)
     spectrum = np.fft.rfft(samples)
@@ -493,7 +496,7 @@ def _moments(samples: Array, settings: GearSettings) -> _Moments:
 def _moments_together(samples: Array, settings: GearSettings) -> _Moments:
     """Return the moments of averages of some channels, few enough for the cache."""
     mean, unknown = _checked(samples).mean(axis=-1), np.full(samples.shape[:-1], np.nan)
-    signals = separate(samples, settings) if settings.mesh_orders else None
+    signals = _separated(samples, settings) if settings.mesh_orders else None
     extents = _extents(samples, mean, np.zeros(mean.shape) if signals is None else
                        signals.amplitudes[..., signals.lines.mesh].sum(axis=-1))
     peak = np.maximum(np.abs(mean) + extents[..., 0], np.sqrt(np.finfo(float).tiny))

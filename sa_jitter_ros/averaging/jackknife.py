@@ -63,7 +63,7 @@ def waveform_parts(means: Sequence[BlockMean]) -> WaveformParts | None:
     if not all(group.count for group in groups):
         return None
     return WaveformParts(np.array([group.count for group in groups], float),
-                         np.ascontiguousarray(np.stack([group.mean.T for group in groups])))
+                         np.array([group.mean.T for group in groups], order='C'))
 
 
 def jackknife_variance(value: Array, without_one: Array, counts: Array) -> Array:

@@ -10,7 +10,6 @@
 
 """The latest rows of a series, as one array."""
 
-
 import numpy as np
 from sa_jitter_ros.arrays import Array
 

@@ -33,13 +33,12 @@ def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
     if min(marks, count) < _FEWEST or settings.revolutions_per_trigger != 1.0 or not orders:
         return ''
     turns = pulses[:count * marks].reshape(count, marks)
-    ends = pulses[marks:count * marks + 1:marks]
-    period = ends - turns[:, 0]
+    period = np.diff(pulses[:count * marks + 1:marks])
     steady = np.abs(period / np.median(period) - 1.0) < _WHOLE
     if 2 * np.count_nonzero(steady) < count:
         return ''
-    part = (np.column_stack((turns, ends)) - turns[:, :1]) / period[:, None]
-    pitch = np.diff(np.median(part[steady], axis=0))
+    part = (turns - turns[:, :1]) / period[:, None]
+    pitch = np.diff(np.median(part[steady], axis=0), append=1.0)
     nominal = np.ones(marks) / pulses_per_revolution
     nominal[np.argmax(pitch)] *= 1.0 + missing_teeth
     off = np.cumsum(pitch - nominal)

@@ -153,11 +153,10 @@ class RecordingAverager:
             self._recording, self.pulses, **target,
             jitter_std=1.0 / math.sqrt(12.0) / rate
             if rate and self._recording.tach is None else None))
-        of_marks = self._values['pulses_per_revolution'], self._values['missing_teeth']
         if not (self.stream.validator.rejected or self.stream.validator.geometry):
             found += [lost_inside_revolutions(
-                self.pulses, self.stream.shafts[item.shaft].settings, *of_marks)
-                for item in series]
+                self.pulses, self.stream.shafts[item.shaft].settings,
+                target['pulses_per_revolution'], target['missing_teeth']) for item in series]
         weak = []  # a shaft of which the vibration shows nothing is no mistake beside others
         for item in series:
             settings = self.stream.shafts[item.shaft].settings

@@ -119,7 +119,7 @@ class StateLevels:
         """
         reach = self.highest - self.lowest
         spikes = (samples > self.highest + reach) | (samples < self.lowest - reach)
-        for first, last in zip(*(item.tolist() for item in _runs(spikes))):
+        for first, last in zip(*_runs(spikes)) if spikes.any() else ():
             if last - first > _SHORT:
                 spikes[first:last] = False
         return np.asarray(spikes)
