@@ -229,3 +229,27 @@ def test_the_vibration_tells_late_marks_from_a_ripple_of_the_speed(rng):
 def test_angles_that_cannot_be_used_are_refused(options, words):
     with pytest.raises(ParameterError, match=words):
         PulseValidator(pulses_per_revolution=4, **options)
+
+
+@pytest.mark.parametrize('extra_mark', [True, False])
+def test_marks_at_any_given_angles_are_followed_through_strays_and_losses(rng, extra_mark):
+    """One of the marks of an extra mark is as near as .15 of a tooth to the next."""
+    for marks in (3, 5, 13, 25):
+        widths = np.ones(marks) if extra_mark else rng.uniform(0.3, 1.7, marks)
+        if extra_mark:
+            widths[1] -= (share := rng.uniform(0.15, 0.5))
+            widths[0] = share
+        edges = np.append(0.0, np.cumsum(widths))[:-1] / widths.sum()
+        late = 2.0 * np.pi * (edges - np.arange(marks) / marks)
+        times = pulses_of(100, late=late - late.mean(), teeth=marks, first=1, rng=rng,
+                          error=5e-5 / SPEED)
+        gone = rng.integers(5 * marks, times.size - 5, 3)
+        strays = rng.uniform(times[5 * marks], times[-5], 3)
+        validator, found, _ = validated(
+            np.sort(np.append(np.delete(times, gone), strays)), pulses_per_revolution=marks,
+            pulses_per_trigger=None, target_geometry='given', target_angles=late)
+        # A lost or stray pulse costs a trigger cycle or two.
+        assert len(found.times) >= 90
+        phase = np.angle(np.exp(2j * np.pi * found.times * SPEED))
+        assert np.max(np.abs(phase - np.median(phase))) < 2e-3 * 2.0 * np.pi
+        assert validator.counts.accepted >= times.size - 6

@@ -31,11 +31,12 @@ from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
     usual_marks)
-from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses
+from sa_jitter_ros.keyphasor_check.marks import (
+    fit_pulses, FittedPulses, number_and_patterns)
 from sa_jitter_ros.keyphasor_check.result import Checked, KeyphasorCheck, Warn
-from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedPulses
+from sa_jitter_ros.keyphasor_check.teeth import FEWEST, NumberedPulses
 from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
-from sa_jitter_ros.keyphasor_check.wheel import Marking, patterns
+from sa_jitter_ros.keyphasor_check.wheel import Marking
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
 from sa_jitter_ros.pulses.pulse_judge import HIDDEN
@@ -112,15 +113,10 @@ class _Check:
         """Return what was found."""
         times = self._pulses()
         self._progress(f'{times.size} pulses from {times[0]:.6g} s to {times[-1]:.6g} s')
-        numbered = number_pulses(times)
+        self._progress('looking for the pattern of the target')
+        numbered, found = number_and_patterns(times)
         clock = find_clock(numbered.times, largest=self._largest)
         tick = 1.0 / clock.rate if clock.rate else 0.0
-        self._progress('looking for the pattern of the target')
-        found = patterns(numbered)
-        if found and found[0].present == 1:  # one mark, and the teeth between are none
-            numbered = numbered.every(found[0].teeth, found[0].origin)
-            found = patterns(numbered)
-        found = [item for item in found if item.present > 1]
         first = fit_pulses(numbered, 1, tick=tick)
         samples = self._samples()
         lines = None

@@ -21,8 +21,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray, IntArray
-from sa_jitter_ros.keyphasor_check.teeth import joined_parts, nearest_pulses, NumberedPulses
-from sa_jitter_ros.keyphasor_check.wheel import Marking, pattern_of
+from sa_jitter_ros.keyphasor_check.teeth import (
+    joined_parts, nearest_pulses, number_pulses, NumberedPulses)
+from sa_jitter_ros.keyphasor_check.uneven_wheel import MOST_MARKS, number_marks
+from sa_jitter_ros.keyphasor_check.wheel import Marking, pattern_of, patterns
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 
 _ROUNDS = 2
@@ -32,6 +34,8 @@ _MOST_AT_ONCE = 200
 _NEIGHBOURS = 7  # with the pulse itself
 _FEWEST_TURNS = 24
 _LEAST_SCATTER = 1e-9  # s
+# Strays and gaps a revolution, and times as bad a fit, with which all pulses may be marks.
+_OFTEN, _BETTER = 0.5, 0.85
 _NEAR = 0.25  # teeth from its mark: a pulse may be that of the mark
 
 
@@ -87,6 +91,14 @@ class FittedPulses:
         return np.asarray((self.numbers - self.pattern.origin) / self.pattern.teeth)
 
     @property
+    def unfit(self) -> float:
+        """Return how far pulses stand from their marks, in teeth; a stray or a gap counts half."""
+        pitch = np.gradient(self.true) / np.gradient(self.numbers.astype(np.float64))
+        away = np.abs(_beside(self.true, self.numbers, np.maximum(pitch, 1e-300)))
+        wrong = self.strays.size + self.lost.size
+        return float(np.minimum(away, 0.5).sum() + 0.5 * wrong) / (self.true.size + wrong)
+
+    @property
     def scatter(self) -> float:
         """Return how far pulses stand from a smooth motion, in s; it holds some of the motion."""
         in_a_row = np.convolve(np.diff(self.numbers) == 1, np.ones(3), 'valid') == 3.0
@@ -119,6 +131,30 @@ class FittedPulses:
         for begin in self.breaks:
             inside[max(begin - step, 0):begin] = False
         return np.asarray((turned / np.maximum(time, 1e-300))[inside & (time > 0.0)])
+
+
+def number_and_patterns(times: FloatArray) -> tuple[NumberedPulses, list[Marking]]:
+    """
+    Return pulses (n,) in s numbered on their target, and its patterns, the best first.
+
+    Where a stray or a gap comes in most revolutions, the numbers of teeth may be wrong, and all
+    pulses those of marks that stand unevenly.
+    """
+    numbered = number_pulses(times)
+    found = patterns(numbered)
+    if found and found[0].present == 1:  # one mark, and the teeth between are none
+        numbered = numbered.every(found[0].teeth, found[0].origin)
+        found = patterns(numbered)
+    found = [item for item in found if item.present > 1]
+    first = fit_pulses(numbered, found[0].teeth if found else 1)
+    wrong = first.strays.size + first.lost.size
+    marks = number_marks(times) if wrong * MOST_MARKS > _OFTEN * times.size else None
+    uneven = [item for item in patterns(marks) if item.present > 1] if marks is not None else []
+    if marks is not None and uneven and wrong * uneven[0].teeth > _OFTEN * times.size:
+        other = fit_pulses(marks, uneven[0].teeth)
+        if other.unfit < _BETTER * first.unfit:
+            return marks, uneven
+    return numbered, found
 
 
 def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> FittedPulses:

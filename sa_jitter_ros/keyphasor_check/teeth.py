@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from scipy.ndimage import rank_filter, uniform_filter1d
 
-#: Pulses from which on a target can be numbered.
-FEWEST = 6
+#: Pulses from which on a target can be numbered; by which the count goes on behind a standstill.
+FEWEST, ACROSS = 6, 50
 # Pulses around one from which its place follows: few follow a changing speed, many see through
 # strays.
 _WINDOWS = (41, 11, 5)
@@ -35,7 +35,6 @@ _BESIDE = 0.1  # of the window: ranks beside the median
 _BETTER = 0.7  # times as bad a fit makes up for fewer pulses
 # A longer silence than so many teeth is a standstill: teeth are counted anew behind it.
 _STANDSTILL = 40.0
-_ACROSS = 50  # by which the count goes on behind a standstill
 _FAR = 0.3  # teeth from its place: no pulse of that tooth
 _PASSES = 3
 # Where the pulses stand on average so many teeth from their places, an interval may be more than a
@@ -97,7 +96,7 @@ def joined_parts(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
     """Return parts as one; the count goes on from part to part by whole targets of `teeth`."""
     numbers = [parts[0].numbers]
     for part in parts[1:]:
-        behind = int(numbers[-1][-1]) + _ACROSS - int(part.numbers[0])
+        behind = int(numbers[-1][-1]) + ACROSS - int(part.numbers[0])
         numbers.append(part.numbers + teeth * -(-behind // teeth))
     places, pitch, strays = (np.concatenate([getattr(part, name) for part in parts])
                              for name in ('places', 'pitch', 'strays'))
@@ -219,7 +218,7 @@ def _places(times: FloatArray, pitch: FloatArray, silent: BoolArray, window: int
         shift = float(np.median(teeth - count))
         places[part] = teeth - shift - count
         numbers[part] = count - count[0] + first
-        first = int(numbers[stop - 1]) + _ACROSS
+        first = int(numbers[stop - 1]) + ACROSS
     return numbers, places, np.asarray(starts[1:], np.int64)
 
 

@@ -40,6 +40,7 @@ _DOUBLE = 0.5
 # The gap must still be distinguished from one that is a tooth wider or narrower.
 _BESIDE_GAP = 0.45
 _ACROSS_GAP = 0.9  # teeth
+_STANDARD = 6.0  # standard deviations within which a deviation is regular
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class Lock:
     `widths`, the steps with what is known of uneven marks. Deviations of the interval behind it
     within `believed` are expected as long as the widths are not known. `interval` (s) is the first
     time from tooth to tooth; `known` intervals had the `scatter`;
-    `intervals` (k,) in s are those from tooth to tooth. If `unsteady`, the speed scatters.
+    `intervals` (k,) in s are those from tooth to tooth. If `unsteady`, the speed scatters; if
+    `even`, no tooth is known from the others: there is no index.
     """
 
     first: int
@@ -64,16 +66,12 @@ class Lock:
     known: int
     intervals: FloatArray
     unsteady: bool = False
+    even: bool = True
 
     @property
     def tooth(self) -> int:
         """Return the number of the tooth of the first pulse."""
         return int(self.steps[:self.slot].sum())
-
-    @cached_property
-    def even(self) -> bool:
-        """Whether no tooth is missing, so that there is no index."""
-        return bool(np.all(self.steps == 1))
 
     @cached_property
     def lists(self) -> tuple[list[int], list[float], list[float]]:
@@ -85,9 +83,10 @@ class Lock:
         if pattern is None:
             return self
         widths = self.widths * np.exp(weight * pattern.widths)
-        return replace(self, widths=widths * self.steps.sum() / widths.sum(),
-                       believed=np.where(pattern.known, 0.0, self.believed),
-                       scatter=pattern.scatter)
+        widths *= self.steps.sum() / widths.sum()
+        believed = np.zeros(widths.size) if self.even else _of_narrow(widths, pattern.scatter)
+        return replace(self, widths=widths, scatter=pattern.scatter,
+                       believed=np.where(pattern.known, believed, self.believed))
 
     def numbered(self) -> 'Lock':
         """Return the lock in which the first pulse is number 0 if there is no index."""
@@ -95,6 +94,11 @@ class Lock:
             return self
         return replace(self, slot=0, widths=np.roll(self.widths, -self.slot),
                        believed=np.roll(self.believed, -self.slot))
+
+
+def _of_narrow(widths: FloatArray, scatter: float) -> FloatArray:
+    """Return deviations (m,) that a scatter of whole intervals explains in narrower ones."""
+    return np.where(widths < 1.0, _STANDARD * scatter / widths, 0.0)
 
 
 def index_of(steps: IntArray) -> int:
@@ -164,7 +168,8 @@ class ToothedWheel:
 
     The positions of the gaps are learnt from one revolution. With several gaps the index is unique
     if the widest gap, or the teeth in front of it, are unique. Otherwise the index may be another
-    one after every loss of the match.
+    one after every loss of the match. `widths` (tooth,), in teeth of an even wheel, are the known
+    angles from each tooth to the next one if the teeth stand unevenly; then none is missing.
 
     The pulses of a wheel 8-1 at one tooth per second; the one after the fifth pulse is missing:
 
@@ -172,15 +177,24 @@ class ToothedWheel:
     >>> lock = wheel.lock(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0]), None)
     >>> lock.slot, lock.tooth, lock.steps.tolist()
     (2, 2, [1, 1, 1, 1, 1, 1, 2])
+
+    Four teeth, the first of which stands near the second:
+
+    >>> wheel = ToothedWheel(teeth=4, tolerance=0.25, widths=np.array([0.3, 1.1, 1.3, 1.3]))
+    >>> wheel.lock(np.array([0.0, 1.3, 2.6, 2.9, 4.0]), None).slot
+    2
     """
 
-    def __init__(self, *, teeth: int, missing: int, tolerance: float) -> None:
+    def __init__(self, *, teeth: int, tolerance: float, missing: int = 0,
+                 widths: FloatArray | None = None) -> None:
         self._teeth, self._present = teeth, teeth - missing
         if self._present < 2:
             raise ParameterError(
                 f'missing_teeth {missing} of {teeth} leaves {self._present} teeth: a wheel needs '
                 '2 or more; for a single tooth set pulses_per_revolution to 1')
-        self._tolerance = tolerance
+        self._tolerance, self._widths = tolerance, widths
+        self._least = _DOUBLE if widths is None else _DOUBLE * float(
+            widths.min() / np.median(widths))
         self.marks = self._present
         self.memory = 2 * (self._present + 1)
 
@@ -198,7 +212,7 @@ class ToothedWheel:
         if every.size <= self._present:
             return None
         intervals = np.diff(every)
-        single = np.append(0, 1 + np.flatnonzero(intervals >= _DOUBLE * np.median(intervals)))
+        single = np.append(0, 1 + np.flatnonzero(intervals >= self._least * np.median(intervals)))
         if single.size <= self._present:
             return None
         single = single[-self._present - 1:]
@@ -206,24 +220,42 @@ class ToothedWheel:
         # At a steady speed the tooth interval follows from the revolution, at a changing one from
         # the intervals around it, of which few may be gaps.
         guesses = [np.full(intervals.size, intervals.sum() / self._teeth)]
-        if self._present >= 8:
+        if self._present >= 8 and self._widths is None:
             guesses.append(median_filter(intervals, size=5, mode='mirror'))
         for guess in guesses:
-            steps = np.maximum(np.rint(intervals / guess), 1.0).astype(np.int64)
-            if steps.sum() == self._teeth:
-                index = index_of(steps)
-                steps = np.roll(steps, -index)
-                tolerance = self._tolerances(steps)
-                error = np.abs(np.roll(intervals / guess, -index) / steps - 1.0)
-                if np.all(error <= tolerance):
-                    slot = -index % steps.size
-                    levels = np.log(intervals / np.roll(steps, -slot))
-                    return Lock(first=int(single[0]), slot=slot, interval=float(guess[0]),
-                                steps=steps, widths=steps.astype(np.float64),
-                                believed=np.where(tolerance > self._tolerance, tolerance, 0.0),
-                                scatter=Chain(single, steps, levels).scatter,
-                                known=levels.size, intervals=intervals[np.roll(steps, -slot) == 1])
+            found = self._matched(intervals / guess)
+            if found is not None:
+                slot, steps, widths, tolerance = found
+                lengths = intervals / np.roll(widths, -slot)
+                levels = np.log(lengths)
+                scatter = Chain(single, steps, levels).scatter
+                return Lock(first=int(single[0]), slot=slot, interval=float(guess[0]),
+                            steps=steps, widths=widths, even=False, scatter=scatter,
+                            believed=np.where(tolerance > self._tolerance, tolerance,
+                                              _of_narrow(widths, scatter)), known=levels.size,
+                            intervals=lengths[np.roll(steps, -slot) == 1])
         return None
+
+    def _matched(self, teeth: FloatArray) -> tuple[int, IntArray, FloatArray, FloatArray] | None:
+        """
+        Return the tooth of the first of the intervals (m,), which are given in teeth.
+
+        And, from the index on, their steps, widths and tolerances; None if they do not fit.
+        """
+        if self._widths is None:
+            steps = np.maximum(np.rint(teeth), 1.0).astype(np.int64)
+            if steps.sum() != self._teeth:
+                return None
+            slot = -index_of(steps) % steps.size
+            steps = np.roll(steps, slot)
+            widths, tolerance = steps.astype(np.float64), self._tolerances(steps)
+        else:
+            turned = [np.roll(self._widths, -slot) for slot in range(teeth.size)]
+            slot = int(np.argmin(np.max(np.abs(teeth / turned - 1.0), axis=1)))
+            steps, widths = np.ones(teeth.size, np.int64), self._widths
+            tolerance = np.full(teeth.size, self._tolerance)
+        error = np.abs(np.roll(teeth, slot) / widths - 1.0)
+        return (slot, steps, widths, tolerance) if np.all(error <= tolerance) else None
 
     def _tolerances(self, steps: IntArray) -> FloatArray:
         gap = steps > 1

@@ -45,6 +45,7 @@ _NO_TEETH = np.empty(0, np.int64)
 _PIECE = 4096  # pulses judged at once
 _RESTART = 3  # pulses after time ran back that begin a new run
 _WHEEL_TOLERANCE = 0.25  # of the intervals in which the gaps of a wheel are found
+_KNOWN_TOLERANCE = 0.15  # of those of a wheel with known uneven marks
 
 
 @dataclass(frozen=True)
@@ -156,16 +157,21 @@ class PulseValidator:
                 f'pulses_per_trigger {per_trigger} does not divide the {teeth} teeth of the '
                 'wheel, so that trigger cycles would begin at changing teeth: choose a divisor '
                 'or a multiple')
+        given = _given_angles(target_geometry, target_angles, teeth - missing_teeth, teeth)
+        widths = 1.0 + teeth / (2.0 * math.pi) * (np.roll(given, -1) - given)
+        tolerance = interval_tolerance or _WHEEL_TOLERANCE
         target: Target = EvenTarget(marks=teeth)
         if missing_teeth:
-            target = ToothedWheel(teeth=teeth, missing=missing_teeth,
-                                  tolerance=interval_tolerance or _WHEEL_TOLERANCE)
+            target = ToothedWheel(teeth=teeth, missing=missing_teeth, tolerance=tolerance)
+        elif np.any(np.abs(widths - 1.0) > tolerance):
+            target = ToothedWheel(teeth=teeth, widths=widths,
+                                  tolerance=interval_tolerance or _KNOWN_TOLERANCE)
         self._counter = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
         self._sink: PulseSink = self._counter
         self._corrector: MarkCorrector | None = None
-        given = _given_angles(target_geometry, target_angles, target.marks, teeth)
         if target_geometry != 'none' and target.marks > 1:
-            self._sink = self._corrector = MarkCorrector(self._counter, count=teeth, given=given)
+            self._sink = self._corrector = MarkCorrector(
+                self._counter, count=teeth, given=given.tolist() or None)
         options = JudgeOptions(
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
@@ -310,12 +316,12 @@ def _in_order(last: float, times: list[float]) -> int:
 
 
 def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
-                  ) -> Sequence[float] | None:
-    """Return the angles (mark,) in rad that are given, None for none; raise ParameterError."""
+                  ) -> npt.NDArray[np.float64]:
+    """Return the angles (mark,) in rad that are given, if any; raise ParameterError."""
     if mode not in GEOMETRY_MODES:
         raise ParameterError(f'target_geometry {mode!r}: use one of {", ".join(GEOMETRY_MODES)}')
     if mode != 'given':
-        return None
+        return np.empty(0)
     if len(angles) != marks:
         raise ParameterError(f'target_angles has {len(angles)} angles for a target of {marks} '
                              f'marks: give one for each, in rad')
@@ -326,4 +332,4 @@ def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
             raise ParameterError(f'target_angles: mark {mark}, {angle} rad late, is not behind '
                                  f'the mark before, {angles[mark - 1]} rad late and '
                                  f'{pitch:.4g} rad away: give the angles in order, in rad')
-    return angles
+    return np.array(angles, np.float64)

@@ -1,0 +1,96 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Wheels with an extra mark, or with marks at any angles: found, and averaged as declared."""
+
+import numpy as np
+import pytest
+import sa_jitter_ros as sa
+from sa_jitter_ros.keyphasor_check.check import check_keyphasor
+from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
+from sa_jitter_ros.keyphasor_check.marks import number_and_patterns
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+
+pytestmark = pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+SPEED = 20.0
+
+
+def edges_of(widths):
+    """Return the angles of marks in revolutions."""
+    return np.append(0.0, np.cumsum(widths))[:-1] / np.sum(widths)
+
+
+def with_extra(marks, share):
+    """Return the angles of even marks and of another one in front of the second."""
+    return edges_of([share, 1.0 - share, *np.ones(marks - 1)])
+
+
+def pulses_on(rng, edges, *, turns=60, share=0.0, ramp=0.2, jitter=2e-5):
+    """Return pulses in s of a speed that grows; a `share` of them is lost, as many are strays."""
+    angle = (np.arange(turns)[:, None] + edges).ravel()
+    times = (angle - ramp * angle**2 / (2.0 * turns)) / SPEED
+    times += rng.normal(0.0, jitter / SPEED, times.size)
+    kept = times[rng.random(times.size) >= share]
+    return np.sort(np.append(kept, rng.uniform(times[0], times[-1], round(share * times.size))))
+
+
+@pytest.mark.parametrize('share', [0.0, 0.01])
+@pytest.mark.parametrize('marks', [4, 12, 24, 60])
+def test_an_extra_mark_is_a_mark(rng, marks, share):
+    edges = with_extra(marks, rng.uniform(0.15, 0.45))
+    numbered, found = number_and_patterns(pulses_on(rng, edges, share=share))
+    assert (found[0].teeth, found[0].present) == (marks + 1, marks + 1)
+    wrong = 2.0 * share * 60 * (marks + 1)
+    assert numbered.strays.size <= 3.0 * np.sqrt(wrong) + wrong + 2
+
+
+@pytest.mark.parametrize('marks', [5, 17])
+def test_marks_at_any_angles_are_measured(rng, marks):
+    edges = edges_of(rng.uniform(0.3, 1.7, marks))
+    check = check_keyphasor(Recording(ArraySource(np.zeros((1, 100))), 100.0,
+                                      pulse_times=pulses_on(rng, edges, ramp=0.0)))
+    assert check.findings['pulses_per_revolution'].value == marks
+    found = np.array(check.findings['marks'].value)
+    late = 2.0 * np.pi * (edges - np.arange(marks) / marks)
+    apart = [np.ptp(np.roll(late, -turn) - found) for turn in range(marks)]
+    assert min(apart) < 2e-3 * 2.0 * np.pi
+
+
+@pytest.mark.parametrize(('teeth', 'missing'), [(60, 2), (36, 1)])
+def test_missing_teeth_stay_missing_teeth_among_many_strays(rng, teeth, missing):
+    edges = np.arange(teeth - missing) / teeth
+    _, found = number_and_patterns(pulses_on(rng, edges, share=0.03))
+    assert (found[0].teeth, found[0].present) == (teeth, teeth - missing)
+
+
+def test_even_marks_among_many_strays_have_no_pattern(rng):
+    for marks in (2, 7, 30):
+        _, found = number_and_patterns(
+            pulses_on(rng, np.arange(marks) / marks, share=0.1, turns=1000 // marks))
+        assert not found
+
+
+def test_what_is_found_is_averaged_without_loss(rng):
+    """Orders come back, and no pulse of the extra mark is taken for a double."""
+    edges, rate = with_extra(12, 0.34), 6000.0
+    pulses = pulses_on(rng, edges, turns=80, ramp=0.0, jitter=1e-6)
+    turns = SPEED * np.arange(round(rate * (pulses[-1] + 0.1))) / rate
+    samples = [sum(np.cos(2.0 * np.pi * order * turns) for order in (1.0, 5.0, 24.0))
+               + 0.1 * rng.normal(size=turns.size)]
+    recording = Recording(ArraySource(np.array(samples)), rate, pulse_times=pulses)
+    check = check_keyphasor(recording)
+    assert check.findings['spurious'].value['count'] == 0
+    declared = machine_parameters(check)['synchronous_averager']
+    averages = sa.average(samples, rate, pulses, orders=[1.0, 5.0, 24.0], **{
+        name: declared[name] for name in (
+            'pulses_per_revolution', 'trigger_cycles', 'target_geometry', 'target_angles')})
+    assert len(averages) >= 7
+    for average in averages:
+        assert np.max(np.abs(np.abs(average.amplitudes) - 1.0)) < 0.02
