@@ -405,3 +405,29 @@ def test_an_angle_that_wraps_at_360_is_told():
     time = np.arange(4000) / 1e3
     with pytest.warns(sa.DataWarning, match='wraps at about 360, .* give modulus=360'):
         sa.pulses_from_angle(time, 9.3 * time % 1.0 * 360.0)
+
+
+@pytest.mark.parametrize('rate', [300.0, 1e3, 10e3])
+@pytest.mark.parametrize('bits', [4, 6, 10])
+def test_positions_in_gray_code_are_refused_with_the_remedy(rate, bits):
+    time = np.arange(int(4.0 * rate)) / rate
+    turned = 7.3 * time + 0.01 * np.sin(20.0 * time)
+    binary = np.floor(2**bits * turned).astype(int) % 2**bits
+    coded = binary ^ (binary >> 1)
+    with pytest.raises(SignalError, match=r'Gray code .* counts \^= counts >> shift'):
+        sa.pulses_from_angle(time, coded, modulus=2**bits)
+    for shift in (1, 2, 4, 8, 16):
+        coded ^= coded >> shift
+    assert sa.pulses_from_angle(time, coded, modulus=2**bits).size == 29
+
+
+@pytest.mark.parametrize('rate', [100.0, 1e3, 10e3])
+def test_an_angle_in_degrees_that_was_unwrapped_is_doubted(rate):
+    time = np.arange(int(4.0 * rate)) / rate
+    angle = 360.0 * 25.2 * time + np.sin(20.0 * time)
+    with pytest.warns(DataWarning, match=r'would turn 14\d\d times a second: .* modulus=360'):
+        sa.pulses_from_angle(time, angle)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert sa.pulses_from_angle(time, angle, modulus=360).size == 100
+        assert sa.pulses_from_angle(time, np.radians(angle)).size == 100

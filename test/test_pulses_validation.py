@@ -616,3 +616,20 @@ def test_marks_keep_their_numbers_across_a_long_gap(rng, marks):
     numbers = np.rint(found.times / 0.01).astype(int)
     assert np.all(numbers == marks * found.count)
     assert numbers[-1] + marks >= 400 > found.times.size * marks > 380
+
+
+@pytest.mark.parametrize(('declared', 'place'), [(25, 0.5), (25, 0.3), (1, 0.3), (24, 0.5)])
+def test_an_extra_mark_on_a_wheel_is_said_with_the_number_of_its_marks(declared, place):
+    """An index beside 24 even marks, declared as one of 25; of 24, all is as it should be."""
+    marks = np.sort(np.append(np.arange(24), place)) / 24.0
+    pulses = (np.arange(40)[:, None] + marks).ravel() / 20.0
+    validator = PulseValidator(pulses_per_revolution=declared)
+    validator.update(pulses + np.random.default_rng(1).normal(0.0, 2e-6, pulses.size))
+    said = [line for line in validator.take_messages() if 'a stray comes after every' in line]
+    assert said == ([] if declared == 24 else [
+        'a stray comes after every 24 pulses, as from an extra mark, the index of a wheel of 24 '
+        'marks: is pulses_per_revolution 24?'])
+    strays = np.sort(np.append(np.arange(960) / 480.0, np.random.default_rng(2).uniform(0, 2, 40)))
+    validator = PulseValidator(pulses_per_revolution=declared)
+    validator.update(strays)
+    assert not any('a stray comes' in line for line in validator.take_messages())

@@ -24,6 +24,7 @@ from sa_jitter_ros.pulses.pulse_judge import PulseJudge
 from sa_jitter_ros.pulses.target import ToothedWheel
 from sa_jitter_ros.pulses.target_geometry import motion_of
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter
+from sa_jitter_ros.pulses.verdicts import Verdicts
 
 MOST_MARKS = 150  # of a revolution
 _FEWEST_MARKS = 3
@@ -81,7 +82,7 @@ def number_marks(times: FloatArray) -> NumberedPulses | None:
     found = _Numbers(marks)
     judge = PulseJudge(target, found, JudgeOptions(
         bridge=True, tolerance=0.0, maximum_missing=3, minimum_interval=0.0,
-        pulses_per_trigger=marks))
+        pulses_per_trigger=marks), Verdicts())
     judge.take(times.tolist())
     judge.flush()
     if len(found.numbers) < _FEWEST_REVOLUTIONS * marks:

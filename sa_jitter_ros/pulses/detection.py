@@ -109,8 +109,7 @@ class KeyphasorDetector:
 
     def __init__(
         self, *, threshold: float | None = None, hysteresis: float = 0.1,
-        polarity: Polarity = 'positive',
-        edge: Edge = 'rising', interpolate: bool = True,
+        polarity: Polarity = 'positive', edge: Edge = 'rising', interpolate: bool = True,
         minimum_interval: float = 0.0, learning_time: float = 0.5, minimum_difference: float = 0.0,
     ) -> None:
         given = {'hysteresis': hysteresis, 'polarity': polarity, 'edge': edge,
@@ -119,12 +118,9 @@ class KeyphasorDetector:
         for item in DETECTOR_PARAMETERS:
             item.convert(given.get(item.name, item.default))
         self._polarity = polarity
-        self._given_threshold = threshold
-        self._hysteresis = hysteresis
-        self._edge = edge
-        self._interpolate = interpolate
-        self._minimum_interval = minimum_interval
-        self._learning_time = learning_time
+        self._given_threshold, self._hysteresis = threshold, hysteresis
+        self._edge, self._interpolate = edge, interpolate
+        self._minimum_interval, self._learning_time = minimum_interval, learning_time
         self._minimum_difference = minimum_difference
         self._learns = threshold is None or hysteresis > 0.0 or polarity == 'auto'
         self.reset()
@@ -133,9 +129,7 @@ class KeyphasorDetector:
         """Forget the levels, the waiting samples, the time and the counts."""
         self._sign = -1.0 if self._polarity == 'negative' else 1.0
         self._decided = self._polarity != 'auto'
-        self._rate = 0.0
-        self._origin = np.nan
-        self._index = 0
+        self._rate, self._origin, self._index = 0.0, np.nan, 0
         self._window: list[Piece] = []
         self._levels: StateLevels | None = None
         self._confirmed = False
@@ -157,9 +151,8 @@ class KeyphasorDetector:
         return KeyphasorState(
             low=low, high=high, threshold=self._sign * self._threshold(levels),
             samples=self._samples, waiting=waiting, pulses=self._pulses,
-            too_close=self._too_close,
-            gaps=self._gaps, windows_without_levels=self._levelless, spikes=self._spikes,
-            polarity='auto' if not self._decided else (
+            too_close=self._too_close, gaps=self._gaps, windows_without_levels=self._levelless,
+            spikes=self._spikes, polarity='auto' if not self._decided else (
                 'positive' if self._sign > 0.0 else 'negative'))
 
     def update(self, samples: npt.ArrayLike, start_time: float, sample_rate: float) -> FloatArray:
@@ -191,9 +184,8 @@ class KeyphasorDetector:
         """Return the pulse times (s) in samples that wait for levels, at a recording's end."""
         return self._learn() if self._levels is None and self._window else _NONE
 
-    def _checked(
-        self, samples: npt.ArrayLike, start_time: float, sample_rate: float,
-    ) -> FloatArray:
+    def _checked(self, samples: npt.ArrayLike, start_time: float, sample_rate: float
+                 ) -> FloatArray:
         given = np.asarray(samples)
         if given.ndim != 1:
             raise SignalError(f'the keyphasor waveform has shape {given.shape}: give one channel')
@@ -205,8 +197,7 @@ class KeyphasorDetector:
             raise SignalError(f'sample rate {sample_rate} Hz differs from {self._rate} Hz before: '
                               'reset the detector to begin a new stream')
         if not np.isfinite(start_time):
-            raise SignalError(f'start time {start_time} s of a block is not finite: give a time '
-                              'in s')
+            raise SignalError(f'start time {start_time} s of a block must be finite')
         block = given.astype(np.float64)
         if not np.all(np.isfinite(block)):
             bad = int(np.argmin(np.isfinite(block)))

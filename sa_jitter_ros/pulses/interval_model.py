@@ -254,8 +254,7 @@ def _is_displacement(deviations: FloatArray) -> bool:
 
 def _is_repeated(step: tuple[float, float], other: tuple[float, float], *, least: float) -> bool:
     """Tell whether of two steps (time, size in s) the other is later and as large."""
-    return (other[0] - step[0] > _APART * least
-            and abs(other[1] - step[1]) < _AS_LARGE * other[1])
+    return other[0] - step[0] > _APART * least and abs(other[1] - step[1]) < _AS_LARGE * other[1]
 
 
 def _expected(weights: tuple[float, ...], levels: list[float], place: int) -> float:

@@ -89,8 +89,7 @@ class LooseMarks:
         off = place - self._fit @ place
         for _ in range(_ROUNDS if np.abs(off).max() > _BESIDE else 0):
             weighted = self._design.T / np.maximum(np.abs(off), _LEAST)
-            off = place - self._design @ np.linalg.solve(
-                weighted @ self._design, weighted @ place)
+            off = place - self._design @ np.linalg.solve(weighted @ self._design, weighted @ place)
         return np.asarray(off)
 
     def _look(self) -> None:

@@ -30,7 +30,6 @@ _LEARNT, _LONGEST = 100, 3.0  # revolutions and seconds
 _TRIED = (8, 32, _LEARNT)  # revolutions after which the pattern is looked for
 _RENEWED, _MEMORY = 50, 1000.0  # revolutions
 _LONG_GAP = 4  # revolutions that are not measured across
-_MESSAGES = 10
 
 
 class MarkCorrector:
@@ -39,12 +38,12 @@ class MarkCorrector:
 
     It takes what `TriggerCounter` takes and gives it to that. A revolution has `count` teeth.
     `geometry` is what is subtracted now, None for nothing, of the `teeth` (mark,) that are there;
-    `messages` say what went wrong.
+    what went wrong it tells `say`.
 
     >>> late = np.array([0.02, 0.0, -0.02])  # rad, at 10 Hz
     >>> numbers = np.arange(601)
     >>> counter = TriggerCounter(teeth=3, teeth_per_trigger=1)
-    >>> corrector = MarkCorrector(counter, count=3)
+    >>> corrector = MarkCorrector(counter, count=3, say=print)
     >>> corrector.begin(0.02 / (20 * np.pi), 0)
     >>> times = numbers / 30 + late[numbers % 3] / (20 * np.pi)
     >>> corrector.extend(times[1:].tolist(), [1] * 600)
@@ -54,8 +53,8 @@ class MarkCorrector:
     """
 
     def __init__(self, counter: TriggerCounter, *, count: int,
-                 given: Sequence[float] | None = None) -> None:
-        self._counter, self._count = counter, count
+                 given: Sequence[float] | None = None, say: Callable[[str], None]) -> None:
+        self._counter, self._count, self._say = counter, count, say
         self._learns = given is None
         self._known: MarkOffsets | None = None  # the latest that was not refused
         if given is not None:
@@ -64,7 +63,6 @@ class MarkCorrector:
         self.geometry: MarkOffsets | None = None
         self.teeth: IntArray = np.empty(0, np.int64)
         self.refused = 0
-        self.messages: list[str] = []
         self._marks = np.zeros(count)  # angle of each tooth that is subtracted, rad
         self._waits = True
         self._shift = 0  # teeth from mark 0 to number 0 of the present runs
@@ -217,11 +215,9 @@ class MarkCorrector:
         """Subtract what was known before no longer, but what was `found`, if anything."""
         self.refused += 1
         found = found if self._learns else None
-        self.messages.append(
-            f'target_geometry: {reason}, from {time:.6f} s on: '
-            + ('the angles of the marks are learnt anew' if found is not None else
-               'no angles are subtracted'))
-        del self.messages[:-_MESSAGES]
+        self._say(f'target_geometry: {reason}, from {time:.6f} s on: '
+                  + ('the angles of the marks are learnt anew' if found is not None else
+                     'no angles are subtracted'))
         self._use(found, teeth)
 
     # --- passing on ---

@@ -28,6 +28,7 @@ explanations have in common is decided:
 If two pulses explain one tooth equally well, neither is used and the tooth counts as missing.
 """
 
+from collections import deque
 from dataclasses import dataclass
 import math
 
@@ -95,10 +96,11 @@ class PulseFollower:
         self._learnt = 0  # times that the pattern was learnt
         self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
         self._alternates = False
-        self._recent: list[float] = []  # of the latest pulses, dropped ones too
+        # the latest pulses, dropped ones too
+        self._recent = deque[float](maxlen=_AGREEING + 1)
         verdicts.counts['accepted'] += 1
         self.confirmed = queue.pop(0)
-        self._remember(self.confirmed)
+        self._recent.append(self.confirmed)
 
     def follow(self, *, final: bool) -> None:
         """Decide about the pulses in the queue, all of them if none follows: `final`."""
@@ -114,13 +116,10 @@ class PulseFollower:
     def _drop(self, kind: str, at: int = 0) -> None:
         """Drop a waiting pulse."""
         pulse = self._queue.pop(at)
-        self._remember(pulse)
+        self._recent.append(pulse)
         self._verdicts.reject(pulse, kind)
         if kind != 'unlocked':
             self._sink.drop()
-
-    def _remember(self, pulse: float) -> None:
-        self._recent = [*self._recent[-_AGREEING:], pulse]
 
     # --- regular pulses ---
 
@@ -152,7 +151,7 @@ class PulseFollower:
             self._lacking = []
             if size == 1:
                 self._look_at_turns(levels)
-            self._recent = [*self._recent, *taken[-_AGREEING - 1:]][-_AGREEING - 1:]
+            self._recent.extend(taken)
             self._note(slots, levels, taken)
             self.slot = (slots[-1] + 1) % size
             self.confirmed = taken[-1]
@@ -316,9 +315,8 @@ class PulseFollower:
         if mark > 1 and abs(deviation) <= tolerance:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
             self._verdicts.counts[kind] += mark - 1
-            self._verdicts.rejected += [
-                (self.confirmed + gap * number / mark, 'missing')
-                for number in range(1, min(mark, _MOST_WAITING))]
+            self._verdicts.rejected += [(self.confirmed + gap * number / mark, 'missing')
+                                        for number in range(1, min(mark, _MOST_WAITING))]
             pulse = self._next(slots, level)
             model.accept([level])
             if self._lacks_alike(mark, gap) or not self._options.bridge:
@@ -395,7 +393,7 @@ class PulseFollower:
         if self._lock.steps.size == 1:
             self.levels, self._alternates = [], False
         pulse = self._queue.pop(0)
-        self._remember(pulse)
+        self._recent.append(pulse)
         self._verdicts.counts['accepted'] += 1
         self.confirmed = pulse
         if len(slots) > self._lock.steps.size:  # a gap of more than a revolution

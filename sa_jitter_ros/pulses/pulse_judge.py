@@ -41,10 +41,10 @@ class PulseJudge:
     `last` is the latest pulse (s) not dropped, `confirmed` the latest that was accepted.
     """
 
-    def __init__(self, target: Target, counter: PulseSink, options: JudgeOptions) -> None:
+    def __init__(self, target: Target, counter: PulseSink, options: JudgeOptions,
+                 verdicts: Verdicts) -> None:
         self._target, self._counter, self._options = target, counter, options
-        self._every = options.tolerance == 1.0
-        self.verdicts = Verdicts()
+        self._every, self.verdicts = options.tolerance == 1.0, verdicts
         self._model = new_model(target, options)
         self.forget()
 

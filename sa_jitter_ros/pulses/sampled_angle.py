@@ -44,6 +44,8 @@ _MOST_BEFORE = 1 << 14  # samples before the shaft turns
 _MOST_AT_ONCE = 50_000_000  # pulses
 _LEAST_MODULUS = 4.0  # counts; with fewer the direction cannot be told
 _USUALLY = 0.9  # of the counts are within the range of a counter
+_GRAY = 0.6  # of the steps of Gray code, below which those of the counts behind it are
+_FASTEST = 1000.0  # turns a second of an angle in rad; more are doubtful
 _EXACT = 2.0 / np.finfo(np.float64).eps  # the largest count that is exact
 
 
@@ -100,8 +102,7 @@ class AngleCrossings:
         if marks != int(marks) or marks < 1:
             raise ParameterError(f'marks {marks} must be a whole number, 1 or more')
         if not 0.0 <= time_tolerance < np.inf:
-            raise ParameterError(f'time_tolerance {time_tolerance} s must be finite and not '
-                                 'negative')
+            raise ParameterError(f'time_tolerance {time_tolerance} s must be finite, from 0 on')
         self._pitch = turn / int(marks)
         self._counted = counted
         self._back = max(0.5 * self._pitch, _DITHER if counted else 0.0)  # of a reversal
@@ -267,10 +268,9 @@ class AngleCrossings:
             return np.empty(0)
         last = math.floor(reached[known] / self._pitch)
         if last - self._next > _MOST_AT_ONCE:
-            raise SignalError(
-                f'the angle passes {last - self._next} marks from {self._time[0]:g} s to '
-                f'{self._time[known]:g} s, at most {_MOST_AT_ONCE} are read: check its unit and '
-                'the number of marks')
+            raise SignalError(f'the angle passes {last - self._next} marks in '
+                              f'{self._time[known] - self._time[0]:g} s, at most {_MOST_AT_ONCE} '
+                              'are read: check its unit and the number of marks')
         marks = np.arange(self._next, last + 1) * self._pitch
         self._next = max(self._next, last + 1)
         index = np.minimum(np.searchsorted(reached, marks), reached.size - 1)  # to rounding
@@ -362,10 +362,8 @@ def _of_counter(counts: FloatArray, marks: int, modulus: float = 0.0) -> AngleCr
                           runs=counter_runs(counts, turn, modulus))
 
 
-def counter_pulses(
-    counts: ArrayLike, *, start_time: float = 0.0, sample_rate: float,
-    pulses_per_revolution: int = 1,
-) -> tuple[FloatArray, AngleState]:
+def counter_pulses(counts: ArrayLike, *, start_time: float = 0.0, sample_rate: float,
+                   pulses_per_revolution: int = 1) -> tuple[FloatArray, AngleState]:
     """
     Return the pulse times (s) of a sampled pulse counter (n,), and its state at the end.
 
@@ -392,10 +390,31 @@ def counter_pulses(
     return start_time + pulses, crossings.state
 
 
-def pulses_from_angle(
-    times: ArrayLike, angle: ArrayLike, *, pulses_per_revolution: int = 1,
-    modulus: float | None = None,
-) -> FloatArray:
+def _is_gray(counts: FloatArray, modulus: float) -> bool:
+    """Return whether counts (n,) change more evenly if they are taken for Gray code."""
+    if counts.size < 2 or counts.min() < 0.0:
+        return False
+    binary = counts.astype(np.int64)
+    for bits in (1, 2, 4, 8, 16, 32):
+        binary ^= binary >> bits
+    steps = np.diff(np.array([counts, binary]))
+    steps -= modulus * np.rint(steps / modulus) if modulus else 0.0
+    coded, decoded = np.abs(steps).mean(axis=1)
+    return bool(decoded < _GRAY * coded)
+
+
+def _other_unit(angle: FloatArray, pulses: FloatArray, marks: float) -> list[str]:
+    """Return why an angle (n,) with these pulses (s) is not in rad; empty if it may be."""
+    if np.count_nonzero(np.abs(np.diff(angle)) > 0.5 * np.ptp(angle)) > 1:
+        return [f'the angle wraps at about {other:g}, no turn in rad: give modulus={other:g}'
+                for other in _OTHER_TURNS if abs(np.ptp(angle) / other - 1.0) < _SIMILAR]
+    turns, span = pulses.size / marks, float(np.ptp(pulses))
+    return [f'an angle in rad would turn {turns / span:.4g} times a second: if it is in degrees, '
+            'give modulus=360'] if 0.0 < _FASTEST * span < turns else []
+
+
+def pulses_from_angle(times: ArrayLike, angle: ArrayLike, *, pulses_per_revolution: int = 1,
+                      modulus: float | None = None) -> FloatArray:
     """
     Return the pulse times (pulse,) in s of a sampled angle (sample,), as from a target on it.
 
@@ -451,6 +470,9 @@ def pulses_from_angle(
         if np.any(np.abs(finite) > _EXACT):
             raise SignalError(f'a count of {np.max(np.abs(finite)):.0f} is above 2^53 and not '
                               'exact: subtract the first one')
+        if _is_gray(finite, modulus or 0.0):
+            raise SignalError('the counts change as Gray code does: convert them, in Python '
+                              'for shift in (1, 2, 4, 8, 16): counts ^= counts >> shift')
         crossings = _of_counter(finite, int(marks), modulus or 0.0)
     else:
         crossings = AngleCrossings(marks=int(marks), turn=turn, runs=AngleRuns(
@@ -465,10 +487,8 @@ def pulses_from_angle(
         return pulses
     found = [f'{state.glitches} samples of the angle are where the shaft cannot be, and were '
              'bridged'] * bool(state.glitches)
-    wraps = np.count_nonzero(np.abs(np.diff(finite)) > 0.5 * np.ptp(finite)) > 1
-    found += [f'the angle wraps at about {other:g}, no turn in rad: give modulus={other:g}'
-              for other in _OTHER_TURNS if turn == _TURN and not whole and wraps
-              and abs(np.ptp(finite) / other - 1.0) < _SIMILAR]
+    if turn == _TURN and not whole:
+        found += _other_unit(finite, pulses, marks)
     found += [f'{state.restarts} jumps of angle or time that are no wrap began a new run'] * bool(
         state.restarts)
     if found:

@@ -155,8 +155,7 @@ def turned_by(known: MarkOffsets, measured: MarkOffsets, turns: IntArray
     """
     every = [turned(known, int(turn)) for turn in turns]
     angles = np.array([item.angles for item in every])
-    variance = measured.standard_errors**2 + np.array(
-        [item.standard_errors for item in every])**2
+    variance = measured.standard_errors**2 + np.array([item.standard_errors for item in every])**2
     off = np.sum((measured.angles - angles)**2 / np.maximum(variance, 1e-300), axis=1)
     best = int(np.argmin(off))
     # Turns by which the pattern repeats itself are the same.

@@ -306,9 +306,8 @@ class SchmittTrigger:
         self._high: bool | None = None
         self._crossing: float | None = None  # the last one, not yet confirmed
 
-    def update(
-        self, samples: FloatArray, index: int, threshold: float, band: float,
-    ) -> tuple[FloatArray, BoolArray]:
+    def update(self, samples: FloatArray, index: int, threshold: float, band: float
+               ) -> tuple[FloatArray, BoolArray]:
         """
         Return the crossings that these samples (n,) confirm and which of them rise, (c,) each.
 

@@ -35,6 +35,7 @@ from sa_jitter_ros.pulses.pulse_judge import PulseJudge
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
+from sa_jitter_ros.pulses.verdicts import Verdicts
 
 __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
@@ -143,9 +144,8 @@ class PulseValidator:
                 f'interval_tolerance {interval_tolerance} must be 0 (learnt), below 0.5 (from '
                 'there on a missing pulse looks like a late one), or 1 (accept every pulse)')
         if every and missing_teeth:
-            raise ParameterError(
-                'interval_tolerance 1 accepts every pulse, so that the gap of missing_teeth '
-                f'{missing_teeth} does not show: set 0 (learnt)')
+            raise ParameterError('interval_tolerance 1 accepts every pulse and hides the gap of '
+                                 f'missing_teeth {missing_teeth}: set 0 (learnt)')
         for name, value in (('minimum_interval', minimum_interval),
                             ('time_tolerance', time_tolerance)):
             if not 0.0 <= value < np.inf:
@@ -153,10 +153,8 @@ class PulseValidator:
         if not np.isfinite(path_delay):
             raise ParameterError(f'path_delay {path_delay} s must be finite')
         if missing_teeth and teeth % per_trigger and per_trigger % teeth:
-            raise ParameterError(
-                f'pulses_per_trigger {per_trigger} does not divide the {teeth} teeth of the '
-                'wheel, so that trigger cycles would begin at changing teeth: choose a divisor '
-                'or a multiple')
+            raise ParameterError(f'pulses_per_trigger {per_trigger} does not divide the {teeth} '
+                                 'teeth of the wheel: choose a divisor or a multiple')
         given = _given_angles(target_geometry, target_angles, teeth - missing_teeth, teeth)
         widths = 1.0 + teeth / (2.0 * math.pi) * (np.roll(given, -1) - given)
         tolerance = interval_tolerance or _WHEEL_TOLERANCE
@@ -166,17 +164,17 @@ class PulseValidator:
         elif np.any(np.abs(widths - 1.0) > tolerance):
             target = ToothedWheel(teeth=teeth, widths=widths,
                                   tolerance=interval_tolerance or _KNOWN_TOLERANCE)
+        verdicts = Verdicts(target.marks)
         self._counter = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
         self._sink: PulseSink = self._counter
         self._corrector: MarkCorrector | None = None
         if target_geometry != 'none' and target.marks > 1:
             self._sink = self._corrector = MarkCorrector(
-                self._counter, count=teeth, given=given.tolist() or None)
-        options = JudgeOptions(
+                self._counter, count=teeth, given=given.tolist() or None, say=verdicts.say)
+        self._judge = PulseJudge(target, self._sink, JudgeOptions(
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
-            pulses_per_trigger=per_trigger)
-        self._judge = PulseJudge(target, self._sink, options)
+            pulses_per_trigger=per_trigger), verdicts)
         self.pulses_per_revolution, self.pulses_per_trigger = teeth, per_trigger
         self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
@@ -224,8 +222,7 @@ class PulseValidator:
     def finish(self) -> PulseCounts:
         """Return the counts at the end of the stream: pulses that still wait are unlocked."""
         counts = self.counts
-        return replace(
-            counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
+        return replace(counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
 
     def update(self, times: npt.ArrayLike) -> TriggerPulses:
         """
@@ -260,9 +257,6 @@ class PulseValidator:
         """Return what pulses cannot do and did, a sentence each, and forget it."""
         verdicts = self._judge.verdicts
         found, verdicts.messages = verdicts.messages, []
-        if self._corrector is not None:
-            found += self._corrector.messages
-            self._corrector.messages = []
         return found
 
     def flush(self) -> TriggerPulses:

@@ -15,6 +15,7 @@ from collections import deque
 #: Latest pulses that were rejected, or are missing, of which times and reasons are kept.
 REMEMBERED = 2000
 _MESSAGES = 10  # that wait
+_ALIKE = 8  # strays, each behind as many pulses as the one before, that are no chance
 
 
 class Verdicts:
@@ -22,10 +23,11 @@ class Verdicts:
     The `counts` of all kinds of pulses, the latest that were `rejected`, and `messages`.
 
     `rejected` are pulses (s) that were not taken as they came, each with the count that it is in,
-    and where pulses are missing.
+    and where pulses are missing. The target has so many `marks`, 0 for unknown.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, marks: int = 0) -> None:
+        self._marks, self._apart, self._alike, self._before = marks, 0, 0, 0  # of strays
         self.counts = dict.fromkeys(
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
              'unlocked', 'relearnt', 'displaced'), 0)
@@ -36,6 +38,14 @@ class Verdicts:
         """Count a pulse (s) that is not taken as it came."""
         self.counts[kind] += 1
         self.rejected.append((pulse, kind))
+        if kind not in ('doubles', 'early'):
+            return
+        apart, self._before = self.counts['accepted'] - self._before, self.counts['accepted']
+        self._alike = self._alike + 1 if apart == self._apart else 1
+        self._apart = apart
+        if self._alike == _ALIKE and 1 < apart != self._marks:
+            self.say(f'a stray comes after every {apart} pulses, as from an extra mark, the index '
+                     f'of a wheel of {apart} marks: is pulses_per_revolution {apart}?')
 
     def say(self, message: str) -> None:
         """Keep a message, and the latest before it."""

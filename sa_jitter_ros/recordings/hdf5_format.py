@@ -21,14 +21,13 @@ from contextlib import contextmanager
 from itertools import islice
 from math import prod
 from pathlib import Path
-import tempfile
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES, RawArray
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import library
+from sa_jitter_ros.recordings.recording import library, mapped
 
 _ROWS_BYTES = 1 << 24
 _MOST_CELLS = 10_000
@@ -91,12 +90,9 @@ def _array(file: Any, name: str, dataset: Any, limit: int) -> RawArray:
     if size <= IN_MEMORY_BYTES:
         return np.asarray(dataset[()]).T
     check_inflation(name, dataset.id.get_storage_size(), size, 'store it without compression')
-    with tempfile.TemporaryFile() as spool:
-        rows = max(1, _ROWS_BYTES * shape[0] // size)
-        for start in range(0, shape[0], rows):
-            spool.write(np.ascontiguousarray(dataset[start:start + rows]).tobytes())
-        spool.flush()
-        return np.memmap(spool, dataset.dtype, 'r', 0, shape).T
+    rows = max(1, _ROWS_BYTES * shape[0] // size)
+    pieces = (dataset[start:start + rows].tobytes() for start in range(0, shape[0], rows))
+    return mapped(pieces, dataset.dtype).reshape(shape).T
 
 
 def _text(name: str, dataset: Any) -> str:

@@ -18,12 +18,12 @@ ignores `mmap_mode` for archives, and reads a member without a limit of its unpa
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from io import BytesIO
 from math import prod
 import os
 from pathlib import Path
 import struct
-import tempfile
 from typing import Any, IO
 import zipfile
 
@@ -33,7 +33,7 @@ from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import Arrays, CONVERTED, RawArray
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
-from sa_jitter_ros.recordings.recording import Recording
+from sa_jitter_ros.recordings.recording import mapped, Recording
 
 _COPY_BYTES = 1 << 20
 _HEADER_BYTES = 10_000
@@ -115,11 +115,8 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str, limit: int) -> RawA
             offset = _data_offset(path, info) + start
             return np.memmap(path, dtype, 'r', offset, shape, order)
         check_inflation(name, info.compress_size, size, 'store it without compression')
-        with tempfile.TemporaryFile() as spool:
-            while chunk := stream.read(_COPY_BYTES):
-                spool.write(chunk)
-            spool.flush()
-            return np.memmap(spool, dtype, 'r', 0, shape, order)
+        pieces = iter(partial(stream.read, _COPY_BYTES), b'')
+        return mapped(pieces, dtype).reshape(shape, order=order)
 
 
 def _read_header(stream: IO[bytes],

@@ -10,14 +10,16 @@
 
 """A recording: a description of the machine, and samples that are read block by block."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Protocol
+import tempfile
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import quoted, RecordingError
 from sa_jitter_ros.parameters import unwrapped
@@ -65,6 +67,14 @@ class ArraySource:
         """Iterate over `channel` x `sample` blocks as float64."""
         for start in range(0, self.samples, samples_per_block):
             yield np.array(self.array[:, start:start + samples_per_block], dtype=np.float64)
+
+
+def mapped(pieces: Iterable[bytes], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array (n,) of the bytes of all pieces, mapped from an unnamed temporary file."""
+    with tempfile.TemporaryFile() as spool:
+        spool.writelines(pieces)
+        spool.flush()
+        return np.memmap(spool, dtype, 'r')
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +311,10 @@ class Recording:
     def _checked(self, source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:
         if samples_per_block < 1:
             raise RecordingError(f'samples_per_block {samples_per_block}: must be at least 1')
-        return _checked_blocks(source.blocks(samples_per_block), self.path)
+        with recording_errors(self.path):
+            for block in source.blocks(samples_per_block):
+                check_samples(block, RecordingError)
+                yield block
 
 
 @contextmanager
@@ -361,13 +374,6 @@ def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[Fl
         held, count = [joined[:, whole:]], count - whole
     if count:
         yield np.concatenate(held, axis=1)
-
-
-def _checked_blocks(blocks: Iterator[FloatArray], path: str) -> Iterator[FloatArray]:
-    with recording_errors(path):
-        for block in blocks:
-            check_samples(block, RecordingError)
-            yield block
 
 
 def _check_positive(name: str, value: float) -> None:
