@@ -201,9 +201,11 @@ def distance(value: Any, error: Any, truth: Any) -> float:
 
 
 def _list_distance(off: Any, errors: Any) -> float:
+    # what is off from the mean has errors that depend on each other: they add up to 0
     known = np.isfinite(errors) & np.isfinite(off)
     z = _over(off[known] - off[known].mean(), errors[known])
-    tail = stats.chi2.sf(np.sum(z**2), max(z.size - 1, 1))
+    tail = stats.chi2.sf(np.sum(z**2) * (1.0 - 1.0 / max(z.size, 1)),
+                         max(z.size - 1, 1))
     return float(stats.norm.isf(max(tail, 1e-300) / 2.0))
 
 

@@ -80,6 +80,7 @@ class Loop:
     recordings: tuple[str, ...]
     unit: str = ''
     faults: tuple[str, ...] = ()
+    ratio_is_stated: bool = False
     created: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(
         timespec='seconds'))
 
@@ -88,7 +89,8 @@ class Loop:
         """Return the report of each shaft by its name; undefined numbers are None."""
         models = {shaft: trace.observation.model for shaft, trace in self.traces.items()}
         return {shaft: report(trace, recordings=self.recordings, shaft=shaft, models=models,
-                              unit=self.unit, created=self.created, faults=self.faults)
+                              unit=self.unit, created=self.created, faults=self.faults,
+                              ratio_is_stated=self.ratio_is_stated)
                 for shaft, trace in self.traces.items()}
 
     @property
@@ -111,8 +113,7 @@ class Loop:
     @property
     def found(self) -> tuple[str, ...]:
         """Return the missing effects with their parameters, a text for each."""
-        several = len(self.shafts) > 1
-        return tuple((f'{shaft}: ' if several else '')
+        return tuple((f'{shaft}: ' if len(self.shafts) > 1 else '')
                      + f'{effect["name"]} {parameters_text(effect, content["unit"])}'
                      for shaft, content in self.shafts.items()
                      for effect in content['missing_effects'])
@@ -205,7 +206,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     opened, faults = _usable(opened, names)
     opened = [_with_pulses(item) for item in opened]
     declaration = _declaration(declared, opened[0].sample_rate)
-    models = declaration.models
+    models, stated = declaration.models, any(item.ratio != 1.0 for item in opened)
     if len(models) > 1:
         opened = [_for_several(item, models) for item in opened]
     traces = {}
@@ -236,7 +237,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
         warnings.warn(fault, DataWarning, stacklevel=2)
     units = {unit for recording in opened for unit in recording.units}
     return Loop(traces, names, units.pop() if len(units) == 1 else '', tuple(
-        dict.fromkeys(faults)))
+        dict.fromkeys(faults)), stated)
 
 
 def _usable(recordings: Sequence[Recording], names: Sequence[str]
@@ -277,8 +278,7 @@ def _times(recording: Recording) -> FloatArray | None:
 
 def _mistake(recording: Recording) -> str:
     """Return what is probably wrong with the pulse times of a recording, '' for nothing."""
-    times = _times(recording)
-    start = recording.start_time
+    times, start = _times(recording), recording.start_time
     return '' if times is None else likely_mistake(
         times, start, start + recording.duration, recording.sample_rate)
 

@@ -20,6 +20,7 @@ import math
 
 from decision_damages import DAMAGES
 from decision_independent import DAMAGED
+import decision_judge
 from decision_judge import Answer, decision, distance, Expected, judge, mcnemar, TICKS
 from decision_machines import groups, rows
 from decision_outside import Absent
@@ -158,6 +159,18 @@ def test_marks_count_from_any_of_them(rng):
     assert distance(np.roll(marks, 2) + 0.3 * rng.standard_normal(6), [0.01] * 6, marks) > 3.0
     assert distance('linear', None, 'linear') == 0.0
     assert distance('cubic', None, 'linear') == math.inf
+
+
+@pytest.mark.parametrize('marks', [2, 4])
+def test_marks_are_as_far_off_as_their_errors_say(rng, marks):
+    """Angles count from their mean, whose error theirs have in common."""
+    off = rng.standard_normal((2000, marks))
+    error = math.sqrt(1.0 - 1.0 / marks)
+    found = np.array([decision_judge._list_distance(
+        row - row.mean(), np.full(marks, error)) for row in off])
+    for most, share in ((1.0, 0.683), (2.0, 0.954)):
+        assert np.mean(found < most) == pytest.approx(share, abs=4.0 * math.sqrt(
+            share * (1.0 - share) / len(off)))
 
 
 @pytest.mark.parametrize(('better', 'worse', 'p'), [

@@ -14,6 +14,7 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 
+from hypothesis import given, settings, strategies as st
 import limit_coverage
 from limit_coverage import limit_of, lines, MODEL, recovered_source, UNIT
 import numpy as np
@@ -515,6 +516,21 @@ def test_skew_beside_the_ticks_of_a_clock_is_found_with_its_error():
         assert error < 0.01 * skew
         off.append((value - skew) / error)
     assert np.max(np.abs(off)) < 3.0
+
+
+def test_jitter_does_not_make_a_skew_grow_with_the_angle():
+    """Corrected pulse times have no jitter, and a skew puts none into them."""
+    for seed in range(2):
+        timing = read_timing([machine(seed, noise=1e-3, walk=1e-7, swing=1e-3, skew=4e-4)])
+        assert timing.choice.best == {'clock_skew'}
+
+
+@given(st.integers(0, 99), st.sampled_from([-3e-3, -1e-4, 4e-5, 2e-3]), st.booleans())
+@settings(max_examples=5)
+def test_a_skew_that_was_found_and_is_declared_is_found_no_more(seed, skew, quiet):
+    part = machine(seed, skew=skew, swing=1e-3, **({'noise': 1e-3, 'walk': 1e-7} if quiet else {}))
+    found, = (item.effect for item in read_timing([part]).findings if item.name == 'clock_skew')
+    assert names_of(read_timing([part], [found])) == set()
 
 
 def test_skew_of_a_machine_whose_speed_changes_is_no_wander():

@@ -17,6 +17,7 @@ import pytest
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import trace
+from sa_jitter_ros.loop import close_loop
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.report import report
@@ -94,6 +95,23 @@ def test_wrong_ratio_grows_with_the_angle_where_the_speed_changes(recording):
     assert 'effects' not in section['ros__parameters']
     corrected = told(recording, replace(MODEL, ratio=section['ros__parameters']['ratio']))
     assert corrected['verdict'] == 'none'
+
+
+@pytest.mark.machines
+@pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+def test_parameter_file_keeps_a_wrong_ratio_that_the_recording_states(recording, tmp_path):
+    """Another one is refused with this recording; a declared skew may grow with the angle."""
+    recording = replace(recording, ratio=0.999)
+    loop = close_loop(recording, {
+        'keyphasor_rate': MODEL.keyphasor_rate, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,
+        'orders': list(ORDERS), 'noise_std': NOISE, 'ratio': 0.999})
+    change, = loop.report['declared_changes']
+    assert (names(loop.report), change['name']) == (['clock_skew'], 'ratio')
+    assert abs(change['value'] - 1.0) < 3.0 * change['standard_error'] < 6e-7
+    file = tmp_path / 'model.yaml'
+    file.write_text(loop.report['parameter_file'])
+    again = close_loop(recording, file).report
+    assert (again['verdict'], again['declared_changes']) == ('none', [])
 
 
 def test_wrong_ratio_at_one_speed_is_said_to_be_inseparable_from_a_skew():

@@ -26,6 +26,12 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 USUAL_SKEW = 5e-3
 
 
+def _periods(setting: Setting) -> Array:
+    """Return the trigger periods without jitter, by the clock of the pulses."""
+    measured, true = (times[-1] - times[0] for times in (setting.times, setting.true_times))
+    return np.asarray(measured / true * trigger_periods(setting.true_times))
+
+
 def _growing(setting: Setting) -> Array:
     """
     Return the delay in trigger periods of pulses whose clock began with that of the vibration.
@@ -33,13 +39,13 @@ def _growing(setting: Setting) -> Array:
     The turn that is common to all pulses takes longer where the speed is low.
     """
     common = np.mean(setting.fitted - setting.begin) / setting.common_period
-    delay = setting.times - setting.begin - common * trigger_periods(setting.true_times)
+    delay = setting.times - setting.begin - common * _periods(setting)
     return np.asarray(delay)[None] / setting.model.trigger_period
 
 
 def _growing_by_angle(setting: Setting) -> Array:
     """Return the delay that grows with the angle, less that of the skew; none if steady."""
-    period = trigger_periods(setting.true_times)
+    period = _periods(setting)
     if np.std(period) < STEADY * period.mean():
         return np.zeros((0, period.size))
     fitted = setting.fitted

@@ -17,14 +17,13 @@ from typing import Any, ClassVar
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
-    fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND, slow_band,
-    slow_memory, WIDEST)
+    ACCELERATION_BAND, fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND,
+    slow_band, slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import Effect, parameter, require_below
 from sa_jitter_ros.effects.timing import FAINT, LARGE, low_passed, Setting, SOURCE, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-_NARROW = 0.05
 _STEEPEST = 4.0  # logarithm of half the order of a spectrum: it falls within 2 % of its width
 
 
@@ -45,9 +44,9 @@ class PhaseWander(Effect):
     pulse_times_correct: ClassVar[bool] = True
     timing: ClassVar[Spectrum] = Spectrum(
         SOURCE, low_passed,
-        tuple((0.0, float(np.log(width)), 0.7) for width in (_NARROW, 0.15, 0.4)),
+        tuple((0.0, float(np.log(width)), 0.7) for width in (ACCELERATION_BAND[0], 0.15, 0.4)),
         (FAINT, None, 0.0), (LARGE, float(np.log(WIDEST)), _STEEPEST),
-        limited=(FAINT, float(np.log(_NARROW)), 0.0))
+        limited=(FAINT, float(np.log(ACCELERATION_BAND[0])), 0.0))
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
     bandwidth: float = parameter(

@@ -102,11 +102,6 @@ class States:
         self.read()
 
     @property
-    def lines_found(self) -> int:
-        """Return the number of undeclared lines."""
-        return self.amplitudes.shape[1] - self.declared
-
-    @property
     def unsure(self) -> float:
         """Return the standard error of the pulse errors (s), those of most pulses."""
         return float(self.size[0] * np.sqrt(1.0 - self.resolved[0]))

@@ -29,10 +29,10 @@ from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
+from sa_jitter_ros.inference.unsteady import SCATTER
 from scipy import special
 
 LINES = 'lines'
-_TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
 _NEAR = 1.5  # ratio of frequencies whose power is alike
 _EVENTS = 4.5  # kurtosis; a gain that swings by a third loses cycles, which makes 4
 
@@ -66,7 +66,7 @@ def check_channels(lines: LineEvidence) -> Check:
         parts = [lines.channel == name, lines.channel != name]
         own, others = (means[:, part] @ weight[part] / weight[part].sum() for part in parts)
         apart, freedom = own - others, len(own) - 1
-        noise = sum(1.0 / weight[part].sum() for part in parts) + _TURN**2
+        noise = sum(1.0 / weight[part].sum() for part in parts) + SCATTER**2
         size = float(np.std(apart, ddof=1))
         checks.append(Check(
             min(1.0, float(special.chdtrc(freedom, freedom * size**2 / noise)) * names.size),
@@ -179,7 +179,7 @@ def _turns(observation: Observation, ratio: Array, noise: Array, order: Array, f
     freedom = max(freedom - 1, 1)  # of the acceleration
     power = np.sum(ratio.imag**2, axis=0) / freedom
     own = np.sqrt(np.maximum(power - noise**2, 0.0))
-    chance = special.chdtrc(freedom, freedom * power / (noise**2 + _TURN**2))
+    chance = special.chdtrc(freedom, freedom * power / (noise**2 + SCATTER**2))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
                  f'the phase of {observation.words(order[worst])} changes by {own[worst]:.2g} '
@@ -226,7 +226,7 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
     total, left = np.var(size, axis=0), np.mean((size - fitted) ** 2, axis=0)
     explained = total - left
     worst = int(np.argmax(explained / noise**2))
-    if not explained[worst] > _TURN**2:
+    if not explained[worst] > SCATTER**2:
         return ()
     ratio = (total[worst] - left[worst]) / 2.0 / (left[worst] / freedom)
     return (Check(float(special.fdtrc(2, freedom, ratio)) * size.shape[1], LINES,

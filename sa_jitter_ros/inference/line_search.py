@@ -130,7 +130,7 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
     found.sort(reverse=True)
     orders: list[float] = []
     tones: list[float] = []
-    room = _MOST_LINES // (1 if states.all_free else 2) - states.lines_found
+    room = _MOST_LINES // (2 - states.all_free) - states.amplitudes[0, states.declared:].size
     least_power = 0.0
     for size, place, tone in found:
         if size < least_power or len(orders) + len(tones) >= room:

@@ -56,8 +56,6 @@ CHANCE = 4
 STRONG = 0.2
 _OTHER_MACHINE = 5.0
 _LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
-# A ripple with more than this many times the power of its noise is corrected.
-_RIPPLE = 3.0
 
 
 def nameless(order: float) -> str:
@@ -388,9 +386,9 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     late = late - late[measured].mean() * common_turn(bridged - late, measured)
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
     ripple = recovery.ripple[span.start + measured[:-1]]
-    ripple_is_clear = np.mean(ripple**2) > _RIPPLE * (
-        recovery.ripple_standard_error**2)  # false with a missing pulse
-    reason = _unresolved(bridged - late, standard_errors, recovery, model, bool(ripple_is_clear))
+    noise = recovery.ripple_standard_error**2
+    resolved = noise < RESOLVED**2 * (np.mean(ripple**2) - noise)  # false with a missing pulse
+    reason = _unresolved(bridged - late, standard_errors, recovery, model, bool(resolved))
     corrected_pulses: FloatArray = bridged if reason else bridged - late
     law = angle_law(model.angle_law)
     used = slice(first - law.before, first + count + 1 + law.after)
@@ -401,7 +399,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         better = pulses.reference[span.start - law.before:span.stop + law.after]
         corrected_pulses = better + errors.mean() * common_turn(better, law.before + measured)
     errors = errors - errors.mean()
-    corrects_ripple = pulses.reference is None and ripple_is_clear and not reason
+    corrects_ripple = pulses.reference is None and resolved and not reason
     corrected_ripple = ripple if corrects_ripple else None
     raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)

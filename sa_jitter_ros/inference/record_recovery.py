@@ -31,6 +31,7 @@ from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.order_band import band_end
 from sa_jitter_ros.inference.record_fit import OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
+from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from scipy import special
@@ -41,9 +42,9 @@ RESOLVED = 0.7
 _WIDER = 16.0  # band in which lines are looked for where the declared ones show no errors
 # Ratio of RMS second differences that counts: to what the errors are wrong by, and of two fits.
 _SMOOTH = 1.5
-# Lines of an average within which an order is one that the shafts are known to have; amplitude, in
-# parts of the channel's strongest declared order, and number of orders that leak.
-_ON_LINE, _STRONG, _MOST = 0.1, 5e-3, 20
+# Lines of an average within which an order is one that the shafts are known to have, and the
+# number of orders that leak.
+_ON_LINE, _MOST = 0.1, 20
 
 
 @dataclass(frozen=True)
@@ -190,8 +191,7 @@ def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     return OpenRecord(
         part, rate, start_time + first / rate, times,
         measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
-        jitter_std=jitter_unit(model), top=top,
-        trend=trend)
+        jitter_std=jitter_unit(model), top=top, trend=trend)
 
 
 def _fitted(record: OpenRecord | None, times: FloatArray, model: DeclaredModel,
@@ -284,7 +284,7 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
         _ON_LINE * resolved)
     found: list[float] = []
     for i in np.lexsort((-share, ~near)).tolist():
-        if i < declared or share[i] < _STRONG or len(found) == _MOST:
+        if i < declared or share[i] < ACCURACY or len(found) == _MOST:
             continue
         exact = _exact(float(fit.orders[i]), model)
         order = float(fit.orders[i]) if exact is None else exact

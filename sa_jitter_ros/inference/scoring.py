@@ -30,7 +30,7 @@ from sa_jitter_ros.inference.gathering import gather
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import (
     ACCURACY, FALSE_ALARM, Residual, residual, Sensitivity)
-from sa_jitter_ros.inference.unsteady import STEADY, unsteady_lines, UnsteadyLine
+from sa_jitter_ros.inference.unsteady import SCATTER, unsteady_lines, UnsteadyLine
 from sa_jitter_ros.prediction.amplitudes import component_gain
 from sa_jitter_ros.prediction.influence import AveragePulses
 from scipy import special
@@ -173,8 +173,8 @@ class Bench:
         count = len(amplitude)
         if special.chdtrc(count, count * np.mean(power / known)) > FALSE_ALARM:
             return 0.0
-        beyond = np.average(np.minimum(power - known, STEADY**2),
-                            weights=(known + STEADY**2) ** -2.0)
+        beyond = np.average(np.minimum(power - known, SCATTER**2),
+                            weights=(known + SCATTER**2) ** -2.0)
         return float(np.sqrt(max(beyond, 0.0)))
 
     def _corrected_variance(self, effects: Sequence[Effect]) -> Array:

@@ -144,9 +144,7 @@ class Chooser:
         count = min(len(row) for row in rows)
         if not count or count > self.data.longest // 4:
             return None
-        return np.stack([self.data.of_errors(
-            [row[i] for row in rows], in_times=pattern.show_in_times) for i in range(count)],
-                        axis=-1)
+        return np.stack([self.data.of_errors(some) for some in zip(*rows)], axis=-1)
 
     def _on_ticks(self, names: frozenset[str]) -> TimingFit | None:
         """
@@ -159,7 +157,8 @@ class Chooser:
                                        for item in self.data.stretches], axis=1) for name in names}
         sizes = {name: fit.pattern(name)[0] for name in names}
         if len(names) != 1 or fit.sizes.size != 1:
-            return fit if self._room([sizes[name] @ found[name] for name in names]) else None
+            left = self._left([sizes[name] @ found[name] for name in names])
+            return fit if ticks_leave_room(*left) else None
         (column,) = found[min(names)]
         step = _STEP / (self.setting.clock_rate * self.data.unit * float(np.ptp(column)))
         tried = fit.sizes[0] + step * np.arange(-round(1.0 / _STEP), round(1.0 / _STEP) + 1)
@@ -172,10 +171,6 @@ class Chooser:
         fit.sizes = np.array([possible @ weight])
         fit.size_covariance = np.array([[(possible - fit.sizes) ** 2 @ weight + step**2 / 12.0]])
         return fit
-
-    def _room(self, known: Sequence[Array]) -> bool:
-        """Tell whether the ticks can make the errors less `known` ones (all pulses), in units."""
-        return ticks_leave_room(*self._left(known))
 
     def _left(self, known: Sequence[Array]) -> tuple[list[Array], float, float]:
         """Return the errors less `known` ones in s, their variance, and the rate of the clock."""

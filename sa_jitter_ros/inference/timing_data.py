@@ -193,11 +193,11 @@ class TimingData:
         return np.asarray(np.concatenate([np.reshape(apart, (-1, self.series)), *rows]
                                          )[self._sorted])
 
-    def of_errors(self, errors: Sequence[Array], *, in_times: bool = True) -> Array:
-        """Return the ordinates that errors (pulse,) of the pulses, in units, make."""
+    def of_errors(self, errors: Sequence[Array]) -> Array:
+        """Return the ordinates that errors (pulse,) make, in units; corrected times lack them."""
         return self.transform([np.column_stack([
-            (in_times - 1.0) * np.diff(row, 2), of_measured(item, row)[:-2],
-            np.zeros(row.size - 2)]) for item, row in zip(self.stretches, errors)])
+            np.zeros(row.size - 2), of_measured(item, row)[:-2], np.zeros(row.size - 2)])
+            for item, row in zip(self.stretches, errors)])
 
     def of_wave(self, direction: str, frequency: float) -> tuple[Array, Array]:
         """Return the ordinates of a unit cosine and sine of a frequency in a direction."""

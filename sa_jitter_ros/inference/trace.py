@@ -26,6 +26,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS, make_effect
+from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, effects_of, Finding, RARE
 from sa_jitter_ros.effects.target_geometry import marks_ahead, TargetGeometry
 from sa_jitter_ros.errors import ModelError
@@ -43,6 +44,7 @@ from sa_jitter_ros.inference.remainder import (
     without_absorbing, without_harmful)
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
+from sa_jitter_ros.inference.timing_choice import RATIO
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.inference.undecided import probabilities, published_change, undecided_effects
 from sa_jitter_ros.recordings.recording import Recording
@@ -153,7 +155,7 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
 
     as_declared = bench.score((), unsteadiness=bench.unsteadiness(()))
     say(f'declared model: RMS residual {as_declared.rms:.4f}')
-    bench, noise = with_its_noise(bench)
+    bench, noise = with_its_noise(_with_its_growth(bench, timing))
     if noise is not None:
         say(f'noise of {noise[0]:.3g} per sample, '
             + ('less than declared' if observation.model.noise_is_declared else 'not declared'))
@@ -199,6 +201,16 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
         probabilities(candidates, timing, [item.name for item in chosen], not_testable), '', noise,
         final[len(chosen) + len(present):], as_declared, gained, left_over, unsteady, not_testable,
         bench.clock)
+
+
+def _with_its_growth(bench: Bench, timing: Timing | None) -> Bench:
+    """Return the bench with a declared clock skew that grows with the angle where it does so."""
+    if timing is None or ClockSkew.name in timing.choice.best:
+        return bench
+    share = timing.choice.fit.sizes[timing.choice.fit.columns.get(RATIO, slice(0))]
+    return replace(bench, declared=tuple(
+        replace(item, by_angle=float(share[0] / item.in_timing(timing.choice.setting)[0]))
+        if isinstance(item, ClockSkew) and share.size else item for item in bench.declared))
 
 
 def _of_findings(chosen: Sequence[Finding], present: Sequence[Finding],

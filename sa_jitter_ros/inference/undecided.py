@@ -27,8 +27,9 @@ from sa_jitter_ros.prediction.prediction import predict
 
 #: The largest change that an effect beside others makes.
 Change = Callable[[Sequence[Effect], Effect], float]
-# Shares of effects that are there, in the open half of the table of decisions.
-_NAMED, _NOT_NAMED, _NOWHERE = 0.98, 0.02, 7e-4
+# Shares of effects that are there, in the open half of the table of decisions; as many of those
+# that are named are not.
+_NOT_NAMED, _NOWHERE = 0.02, 7e-4
 
 
 def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[EffectLimit]
@@ -74,5 +75,5 @@ def probabilities(candidates: Sequence[Candidate], timing: Timing | None, named:
     odds = {item.name: item.finding.probability for item in candidates}
     odds |= timing.probabilities if timing is not None else {}
     found = {name: _NOWHERE + _NOT_NAMED * value for name, value in odds.items()}
-    found |= dict.fromkeys(named, _NAMED)
+    found |= dict.fromkeys(named, 1.0 - _NOT_NAMED)
     return {name: value for name, value in found.items() if name not in not_testable}

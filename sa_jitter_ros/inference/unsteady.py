@@ -27,7 +27,7 @@ from scipy import special
 
 #: Relative scatter of an amplitude from average to average that steady machines were measured to
 #: have and that no effect describes (docs/measured_cases.md).
-STEADY = 0.02
+SCATTER = 0.02
 #: The same of ordinary machines (6 % on a bearing rig): beyond it, the machine is unexplained.
 ORDINARY = 0.07
 
@@ -59,8 +59,7 @@ def unsteady_lines(amplitude: Array, known: Array, orders: Array, channels: Sequ
         return ()
     relative = amplitude / amplitude.mean(axis=0) - 1.0
     power = np.var(relative, axis=0, ddof=1)
-    chance = lines.count * special.chdtrc(
-        count - 1, (count - 1) * power / (known + STEADY**2))
+    chance = lines.count * special.chdtrc(count - 1, (count - 1) * power / (known + SCATTER**2))
     found = np.flatnonzero(chance < FALSE_ALARM)
     size = np.sqrt(np.maximum(power - known, 0.0))
     return tuple(UnsteadyLine(float(orders[lines.order[i]]), channels[lines.channel[i]],
@@ -69,8 +68,7 @@ def unsteady_lines(amplitude: Array, known: Array, orders: Array, channels: Sequ
 
 def unsteady_text(lines: Sequence[UnsteadyLine], words: Callable[[float], str]) -> str:
     """Return which lines vary, the worst first; `words` names an order in a sentence."""
-    worst = lines[0]
-    others = len(lines) - 1
-    more = f' (and {others} more: see unsteady_lines)' if others else ''
+    worst, *others = lines
+    more = f' (and {len(others)} more: see unsteady_lines)' if others else ''
     return (f'the amplitude of {words(worst.order)} on {worst.channel} varies by '
             f'{percent_text(worst.scatter)} RMS from average to average{more}')

@@ -25,12 +25,13 @@ _OF_SHAFT = ('ratio', 'orders')
 _DIGITS, _DIGITS_OF_RATIO = 6, 10
 
 
-def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
+def new_section(trace: Trace, models: Mapping[str, DeclaredModel], *,
+                ratio_is_stated: bool = False) -> str:
     """
     Return the section of `jitter_predictor` with what was found, '' where nothing was.
 
     It declares the `models` of all shafts, by their names, as before, with the effects added; what
-    is new has a remark.
+    is new has a remark. A wrong ratio that a recording states, too, is declared as a clock skew.
     """
     found = {item.name: item.effect for item in (*trace.findings, *trace.refinements)
              if item.effect is not None}
@@ -50,7 +51,7 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
                 values[place] = value
     remarks = {}
     skew = found.get(ClockSkew.name)
-    if isinstance(skew, ClockSkew) and skew.by_angle == 1.0:
+    if isinstance(skew, ClockSkew) and skew.by_angle == 1.0 and not ratio_is_stated:
         del found[ClockSkew.name]
         for place in (f'{shaft}.ratio' if named else 'ratio' for shaft, each in models.items()
                       if (each.ratio, each.orders) == (model.ratio, model.orders)):

@@ -37,13 +37,14 @@ Json = Any
 
 def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SHAFT,
            models: Mapping[str, DeclaredModel] = MappingProxyType({}), unit: str = '',
-           created: str = '', faults: Sequence[str] = ()) -> Mapping[str, Json]:
+           created: str = '', faults: Sequence[str] = (), ratio_is_stated: bool = False
+           ) -> Mapping[str, Json]:
     """
     Return the content of `report.json`; undefined numbers are None.
 
     `shaft` is the name of the shaft, `models` are those of all shafts that are declared beside it;
     `unit` is that of the vibration, `created` the time of the analysis; `faults` of the recordings
-    are the first remarks.
+    are the first remarks. `ratio_is_stated` in a recording: the parameter file keeps it.
     """
     observation = trace.observation
     orders = observation.orders
@@ -66,7 +67,8 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'unit': unit,
         'created': created,
         'version': __version__,
-        'parameter_file': new_section(trace, models or {shaft: observation.model}),
+        'parameter_file': new_section(trace, models or {shaft: observation.model},
+                                      ratio_is_stated=ratio_is_stated),
         'remarks': [*faults, *observation.pulses.remarks, *_not_compared(trace)],
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
