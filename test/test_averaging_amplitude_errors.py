@@ -287,7 +287,7 @@ def test_orders_that_jitter_leaks_into_the_same_place_add_with_their_phases(rng,
     u = (np.arange(64) + 0.5) / 64
     errors = std * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, count + 1)
     angle = u + errors[:-1, None] * (1.0 - u) + errors[1:, None] * u
-    wave = sum(size * np.exp(2j * np.pi * order * angle) for size, order in zip(true[0], orders))
+    wave = np.einsum('k,kcu->cu', true[0], np.exp(2j * np.pi * orders[:, None, None] * angle))
     cycles = (wave.real @ np.exp(-2j * np.pi * np.outer(u, orders)) / 32)[:, None]
     jittered = _Jittered.of(true, orders, std**2, 1.8, 1.0, whole=True)
     apart = cycles - cycles.mean(axis=0)

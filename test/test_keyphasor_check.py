@@ -10,17 +10,23 @@
 
 """Targets, strays, clocks and jitter of which nothing is declared are found as they are."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import RecordingError, SignalError
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.clock import find_clock
+from sa_jitter_ros.keyphasor_check.costs import _of_speed
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
-from sa_jitter_ros.keyphasor_check.lines import marks_evidence, ToothLines
+from sa_jitter_ros.keyphasor_check.lines import (
+    _per_line, find_lines, marks_evidence, on_orders, ToothLines)
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
+from sa_jitter_ros.keyphasor_check.vibration import recovered_jitter
 from sa_jitter_ros.keyphasor_check.wheel import patterns
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -444,3 +450,78 @@ def test_a_vibration_may_repeat_several_times_in_a_revolution():
     one, two, four = marks_evidence(lines, [1, 2, 4]).values()
     assert 1.0 < one - two < 2.5  # not the four lines that would be at odd orders by chance
     assert 1.5 < one - four < 3.5
+
+
+def test_a_line_that_falls_anywhere_says_nothing_for_a_shaft(rng):
+    """The likelihood ratio of a random line has the mean 1, however dense the orders are."""
+    for ratio in (0.06, 0.3, 2.0):
+        lines = ToothLines(np.sort(rng.uniform(50.0, 100.0, 200_000)), *np.ones((2, 200_000)), 0.05)
+        on = on_orders(lines, ratio)[1].mean()
+        said = np.exp(_per_line(lines, ratio))
+        assert on * said + (1.0 - on) * 0.3 == pytest.approx(1.0, abs=0.05)
+
+
+def test_noise_that_a_resonance_colours_makes_no_lines(rng):
+    white = np.fft.rfft(rng.standard_normal(12_000))
+    place = np.arange(white.size)
+    samples = np.fft.irfft(white * (1.0 + 30.0 * np.exp(-0.5 * ((place - 2500) / 250.0) ** 2)))
+    turned = np.arange(200.0)
+    lines = find_lines(samples[:, None], 0.0, 12_000.0, turned / 200.0, turned)
+    assert lines.places.size <= 2
+
+
+def test_the_tach_shaft_with_orders_of_its_own_is_the_one_of_interest(rng):
+    """Nobody named another shaft, whose lines are stronger and more."""
+    own = vibration(rng, orders=((1.0, 0.5), (2.0, 0.5), (3.0, 0.5), (4.0, 0.5), (5.0, 0.3)))
+    other = vibration(rng, ratio=2.40789)
+    assert checked(own + 3.0 * other, tach(rng)[0]).findings['ratio'].value == 1.0
+
+
+def test_a_speed_that_wanders_within_some_revolutions_makes_no_strays(rng):
+    turns = np.arange(300)
+    times = (turns + 0.3 * np.sin(2.0 * np.pi * turns / 40.0)) / 25.0 + rng.normal(0.0, 1e-6, 300)
+    fitted = fit_pulses(number_pulses(times), 1)
+    assert (fitted.true.size, fitted.strays.size, fitted.lost.size) == (300, 0, 0)
+    assert fitted.scatter < 1e-4
+
+
+@pytest.mark.parametrize(('scatter', 'shown'), [(0.3, False), (0.8, True)])
+def test_pulse_errors_below_their_own_uncertainty_show_no_jitter(rng, scatter, shown):
+    average, *_ = sa.average(vibration(rng), RATE, tach(rng)[0], orders=[19.0], trigger_cycles=40,
+                             correct_jitter=True, keyphasor_rate=3000.0)
+    known = np.full(41, 1e-5)
+    def drawn():
+        errors = rng.normal(0.0, np.hypot(1.0, scatter) * 1e-5, 41)
+        errors -= errors.mean()
+        return replace(average, correction=replace(
+            average.correction, accepted=True, pulse_errors=errors, standard_errors=known))
+    found = recovered_jitter([drawn() for _ in range(200)])
+    assert (found is not None) == shown
+    if shown:
+        assert found.std == pytest.approx(scatter * 1e-5, rel=0.1)
+
+
+def test_places_of_marks_without_errors_are_not_declared(rng):
+    late = (0.02, -0.02)
+    check = checked(vibration(rng), tach(rng, 2, late=late)[0])
+    nodes = machine_parameters(check)
+    assert 'target_angles' in str(nodes)
+    findings = {**check.findings, 'marks': replace(check.findings['marks'], standard_error=None)}
+    assert 'target_angles' not in str(machine_parameters(replace(check, findings=findings)))
+
+
+def test_cost_of_a_run_up_is_what_the_straight_angle_law_loses():
+    """At a speed that grows by 2 % in each revolution, within which it is ahead by its half."""
+    fitted = SimpleNamespace(speed=25.0 * 1.02 ** np.arange(50.0),
+                             pattern=SimpleNamespace(present=1))
+    found, = _of_speed(fitted, 1.0, [20.0, 40.0], None)
+    u = (np.arange(1000) + 0.5) / 1000
+    lost = [100.0 - 100.0 * abs(np.mean(np.exp(2j * np.pi * g * 0.01 * u * (1.0 - u))))
+            for g in (20.0, 40.0)]
+    np.testing.assert_allclose([cost for _, cost in found.cost], lost, rtol=0.25)
+
+
+def test_what_marks_do_not_show_of_the_speed_is_given_in_per_cent():
+    found, = _of_speed(None, 1.0, [1.0, 2.0], (np.array([0.1, 0.2]), np.array([0.01, 0.013])))
+    assert 'no order here then loses more than 1.3 %' in found.text
+    assert dict(found.cost) == {1.0: 10.0, 2.0: 20.0}

@@ -43,6 +43,8 @@ def test_the_right_teeth_are_not_contradicted():
 
 @pytest.mark.parametrize(('wrong', 'name'), [
     ({'first': 20}, 'first.teeth is 20, but 5 lines of the vibration fit 19'),
+    ({'first': 17}, 'first.teeth is 17, but 5 lines of the vibration fit 19'),
+    ({'first': 22}, 'first.teeth is 22, but 5 lines of the vibration fit 19'),
     ({'second': 60}, 'first.mate_teeth is 60, but 5 lines of the vibration fit 61'),
     ({'third': 33}, 'second.teeth is 33, but 5 lines of the vibration fit 32'),
     ({'fourth': 25}, 'second.mate_teeth is 25, but 5 lines of the vibration fit 24')])
