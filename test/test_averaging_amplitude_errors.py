@@ -58,6 +58,7 @@ def hold(found, trials):
     return np.abs(found - wanted) < 0.03 + 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('count', 'noise', 'turn'), [
     (6, 0.01, 0.3), (10, 0.01, 0.02), (10, 0.05, 0.3), (40, 0.01, 0.8), (160, 0.01, 0.3)])
 def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
@@ -128,6 +129,7 @@ def test_errors_of_a_sideband_hold_what_jitter_leaks_into_the_mean(count, turn, 
     assert hold(shares((size - np.mean(size)) / along), trials).all()
 
 
+@pytest.mark.machines
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 def test_corrected_errors_are_the_distance_from_the_truth():
     """Also of the phase, which the mean of the pulse errors turns, and which no one can know."""
@@ -156,6 +158,7 @@ def test_corrected_errors_are_the_distance_from_the_truth():
     assert np.all(np.mean(limits, axis=0) > 0.92 - 3.0 * np.sqrt(0.05 * 0.95 / trials))
 
 
+@pytest.mark.machines
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 @pytest.mark.parametrize(
     ('count', 'turn', 'ratio'), [(10, 0.3, 1.0), (40, 0.8, 1.0), (10, 0.3, 2.4)])
@@ -269,7 +272,7 @@ def test_the_mean_of_all_pulse_errors_turns_the_corrected_phase(count):
 
 
 def test_what_turns_a_phasor_does_not_make_its_size_uncertain(rng):
-    """Phases that scatter from cycle to cycle by more than the pulses do, whose jitter is known."""
+    """Phases scatter from cycle to cycle by more than the pulses do, whose jitter is known."""
     count, noise = 60, 1e-3
     turned = np.exp(0.1j * rng.standard_normal((count, 1, 1)))
     white = noise * (rng.standard_normal((count, 1, 1, 2)) @ (1.0, 1.0j))
@@ -287,7 +290,7 @@ def test_orders_that_jitter_leaks_into_the_same_place_add_with_their_phases(rng,
     u = (np.arange(64) + 0.5) / 64
     errors = std * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, count + 1)
     angle = u + errors[:-1, None] * (1.0 - u) + errors[1:, None] * u
-    wave = np.einsum('k,kcu->cu', true[0], np.exp(2j * np.pi * orders[:, None, None] * angle))
+    wave = np.tensordot(true[0], np.exp(2j * np.pi * orders[:, None, None] * angle), axes=1)
     cycles = (wave.real @ np.exp(-2j * np.pi * np.outer(u, orders)) / 32)[:, None]
     jittered = _Jittered.of(true, orders, std**2, 1.8, 1.0, whole=True)
     apart = cycles - cycles.mean(axis=0)

@@ -22,7 +22,7 @@ from sa_jitter_ros.keyphasor_check.clock import find_clock
 from sa_jitter_ros.keyphasor_check.costs import _of_speed
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
-    _per_line, find_lines, marks_evidence, on_orders, ToothLines)
+    _per_line, marks_evidence, on_orders, ToothLines)
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
@@ -308,6 +308,7 @@ def test_strays_alone_are_no_wheel(rng, count):
         checked(vibration(rng), np.sort(rng.uniform(0.0, SECONDS, count)))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'missing'), [(1, ()), (8, ()), (36, (35,))])
 def test_a_wheel_with_a_fifth_lost_and_as_many_strays_is_one(rng, marks, missing):
     pulses, *_ = tach(rng, marks, missing=missing, lost=0.2)
@@ -339,6 +340,7 @@ def test_delay_of_the_tach_turns_all_orders_alike(rng, delay):
     assert found.standard_error < 2e-5
 
 
+@pytest.mark.machines
 def test_delay_has_the_error_that_is_stated(rng):
     """Over 8 drawn machines whose speed hardly changes: all pulses of one turn all orders."""
     found = [checked(vibration(rng, drift=0.05), tach(rng, drift=0.05, jitter=2e-5)[0]).findings[
@@ -377,6 +379,7 @@ def test_delay_is_not_given_where_orders_disagree(rng):
 
 # --- measured -----------------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'marks', 'missing', 'clock', 'speed'), [
     ('gear0_gearbox', 1, 0, None, 33.33),
     ('motor_30V_100kHz', 8, 0, 100e3, 94.4),
@@ -403,6 +406,7 @@ def test_measured_engines(shared_data, name, missing):
     assert 'uneven_marks' in codes(check)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('ripple', 'late'), [(3.4, 0.0), (0.5, 0.0), (0.0, 2.0), (0.0, 0.5)])
 def test_the_vibration_tells_uneven_marks_from_a_speed_that_ripples(ripple, late):
     """The pulses of both are alike; degrees. A crank gets trigger cycles from mark to mark."""
@@ -455,19 +459,11 @@ def test_a_vibration_may_repeat_several_times_in_a_revolution():
 def test_a_line_that_falls_anywhere_says_nothing_for_a_shaft(rng):
     """The likelihood ratio of a random line has the mean 1, however dense the orders are."""
     for ratio in (0.06, 0.3, 2.0):
-        lines = ToothLines(np.sort(rng.uniform(50.0, 100.0, 200_000)), *np.ones((2, 200_000)), 0.05)
+        places = np.sort(rng.uniform(50.0, 100.0, 200_000))
+        lines = ToothLines(places, *np.ones((2, places.size)), 0.05)
         on = on_orders(lines, ratio)[1].mean()
         said = np.exp(_per_line(lines, ratio))
         assert on * said + (1.0 - on) * 0.3 == pytest.approx(1.0, abs=0.05)
-
-
-def test_noise_that_a_resonance_colours_makes_no_lines(rng):
-    white = np.fft.rfft(rng.standard_normal(12_000))
-    place = np.arange(white.size)
-    samples = np.fft.irfft(white * (1.0 + 30.0 * np.exp(-0.5 * ((place - 2500) / 250.0) ** 2)))
-    turned = np.arange(200.0)
-    lines = find_lines(samples[:, None], 0.0, 12_000.0, turned / 200.0, turned)
-    assert lines.places.size <= 2
 
 
 def test_the_tach_shaft_with_orders_of_its_own_is_the_one_of_interest(rng):
@@ -475,14 +471,6 @@ def test_the_tach_shaft_with_orders_of_its_own_is_the_one_of_interest(rng):
     own = vibration(rng, orders=((1.0, 0.5), (2.0, 0.5), (3.0, 0.5), (4.0, 0.5), (5.0, 0.3)))
     other = vibration(rng, ratio=2.40789)
     assert checked(own + 3.0 * other, tach(rng)[0]).findings['ratio'].value == 1.0
-
-
-def test_a_speed_that_wanders_within_some_revolutions_makes_no_strays(rng):
-    turns = np.arange(300)
-    times = (turns + 0.3 * np.sin(2.0 * np.pi * turns / 40.0)) / 25.0 + rng.normal(0.0, 1e-6, 300)
-    fitted = fit_pulses(number_pulses(times), 1)
-    assert (fitted.true.size, fitted.strays.size, fitted.lost.size) == (300, 0, 0)
-    assert fitted.scatter < 1e-4
 
 
 @pytest.mark.parametrize(('scatter', 'shown'), [(0.3, False), (0.8, True)])
@@ -499,15 +487,6 @@ def test_pulse_errors_below_their_own_uncertainty_show_no_jitter(rng, scatter, s
     assert (found is not None) == shown
     if shown:
         assert found.std == pytest.approx(scatter * 1e-5, rel=0.1)
-
-
-def test_places_of_marks_without_errors_are_not_declared(rng):
-    late = (0.02, -0.02)
-    check = checked(vibration(rng), tach(rng, 2, late=late)[0])
-    nodes = machine_parameters(check)
-    assert 'target_angles' in str(nodes)
-    findings = {**check.findings, 'marks': replace(check.findings['marks'], standard_error=None)}
-    assert 'target_angles' not in str(machine_parameters(replace(check, findings=findings)))
 
 
 def test_cost_of_a_run_up_is_what_the_straight_angle_law_loses():
