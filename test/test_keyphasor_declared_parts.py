@@ -69,6 +69,7 @@ def test_a_planetary_stage():
     assert [item.code for item in contradictions(lines, other)] == ['mesh_absent']
 
 
+@pytest.mark.machines
 def test_random_lines_contradict_nothing_by_chance():
     """Of 200 machines whose lines are somewhere, beside two harmonics of the mesh."""
     rng = np.random.default_rng(1)
@@ -78,6 +79,7 @@ def test_random_lines_contradict_nothing_by_chance():
     assert len(codes) <= 2
 
 
+@pytest.mark.machines
 def test_a_check_takes_the_machine():
     time = np.arange(200_000) / 5e3
     angle = 2.0 * np.pi * RATIO * 10.0 * time

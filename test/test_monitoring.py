@@ -50,6 +50,7 @@ def alarms_of(draw, *, units, quantities, learning, scores, length):
     return found, units * (length - learning) / scores
 
 
+@pytest.mark.machines
 def test_evidence_reaches_its_threshold_once_in_the_stated_number_of_scores():
     rng = np.random.default_rng(1)
     units, quantities, scores = 400, 4, 400.0
