@@ -201,6 +201,7 @@ def test_indicators_change_too_and_fall():
     assert found.change == pytest.approx(-0.06, abs=4.0 * found.standard_error)
 
 
+@pytest.mark.machines
 def test_standard_errors_of_changes_hold():
     """Without selection: the estimate of what came since a change that is far above threshold."""
     z = []
