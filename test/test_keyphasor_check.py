@@ -248,6 +248,7 @@ def test_cost_of_a_coarse_clock_is_what_an_average_loses(rng):
 
 # --- what does not fit --------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('code', 'change', 'rate'), [
     ('unit_ms', lambda times: 1e3 * times, RATE),
     ('unit_samples', lambda times: np.rint(RATE * times), RATE),
