@@ -172,6 +172,7 @@ def test_methods_are_timed_in_turns(benchmark):
     assert 0.0 <= timings['a'].best <= timings['a'].median
 
 
+@pytest.mark.campaign
 def test_memory_does_not_grow_with_the_record(benchmark):
     _, short, _, long = benchmark('core_speed').memory(0.4).values()  # 4 and 16 s
     assert long < 1.05 * short

@@ -65,6 +65,7 @@ def test_the_table_is_what_the_library_chooses(tmp_path, capsys, name):
     assert output.read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.machines
 def test_given_settings_are_assessed(tmp_path, capsys):
     output = tmp_path / 'design.svg'
     assert design.main([*BENCH, '--keyphasor-rate', '5000', '--trigger-cycles', '41',

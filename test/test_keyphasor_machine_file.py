@@ -60,6 +60,7 @@ def run_all(path, folder, capsys):
     return ''.join(capsys.readouterr()), json.loads((folder / 'loop/report.json').read_text())
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('turns', 'marks'), [(9, 6), (9, 1)])
 def test_a_short_recording_is_averaged_and_says_what_is_too_short(tmp_path, capsys, turns, marks):
     write_rig(tmp_path / 'rig.npz', turns=turns, marks=marks)

@@ -51,6 +51,7 @@ def found(recording):
     return close_loop([recording], KEYWORDS)
 
 
+@pytest.mark.machines
 def test_every_way_to_name_recording_and_model_finds_the_same(recording, found, tmp_path):
     path, declared = tmp_path / 'rig.npz', tmp_path / 'model.yaml'
     np.savez(path, vibration=recording.read(), sample_rate=RATE, pulse_times=recording.pulse_times)
@@ -118,6 +119,7 @@ def test_gap_in_the_vibration_costs_the_trigger_cycles_that_it_touches(recording
     assert len(observation.acquisitions) >= 15
 
 
+@pytest.mark.machines
 def test_reference_that_is_the_pulse_times_is_none(recording, found):
     twice = replace(recording, reference_pulse_times=recording.pulse_times)
     content = close_loop(twice, KEYWORDS).report
