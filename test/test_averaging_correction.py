@@ -187,6 +187,7 @@ def test_noise_alone_is_not_changed():
         correction = average.correction
         assert not correction.accepted
         assert correction.reason
+        assert correction.refitted == 0
         np.testing.assert_array_equal(
             correction.waveform, average.waveform)
 

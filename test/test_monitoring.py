@@ -147,6 +147,13 @@ def test_skewness_that_the_baseline_shows_is_no_change(rng):
     assert np.mean(scored(rng.gamma(4.0, size=(300, 3000))) > 3.0) < 0.006
 
 
+def test_what_is_unsure_of_the_amplitudes_is_so_of_moments_by_their_power():
+    average = Machine(21, bias=0.02).average()
+    assert average.layout.indicators == ('rms', 'kurtosis', 'm8a')
+    unsure = average.doubt[:, len(average.layout.orders):][:, :3]
+    np.testing.assert_allclose(unsure, 0.02 * np.array([[1.0, 4.0, 8.0]] * 2), rtol=0.05)
+
+
 @pytest.mark.parametrize('amplitude', [0.0, 0.3, 5.0])
 def test_squares_of_amplitudes_scatter_as_those_of_drawn_ones(rng, amplitude):
     noise, doubt = 0.2, 0.01

@@ -13,7 +13,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.pulses.interval_model import IntervalModel
-from sa_jitter_ros.pulses.mark_pattern import repeating, steady_pattern
+from sa_jitter_ros.pulses.mark_pattern import regular_start, repeating, steady_pattern
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings import read
@@ -497,3 +497,10 @@ def test_a_steady_shaft_narrows_the_tolerance_to_what_no_average_shows(pulses, n
     model = IntervalModel(given=0.0, pulses_per_trigger=pulses, block=8)
     model.start(0.0, scatter=0.0, count=200)
     assert model.tolerance == pytest.approx(narrowest)
+
+
+@pytest.mark.parametrize(('levels', 'first'), [
+    ([], 0), ([0.3, 0.0], 0), ([0.3, 0.0, 0.0, 0.0], 1), ([0.5, 0.1, 0.2, 0.3], 1),
+    ([0.0, 1.0, 9.0], 0)])
+def test_intervals_are_regular_from_the_first_that_others_confirm(levels, first):
+    assert regular_start(np.array(levels), 0.01) == first
