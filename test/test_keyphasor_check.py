@@ -479,6 +479,7 @@ def test_pulse_errors_below_their_own_uncertainty_show_no_jitter(rng, scatter, s
     average, *_ = sa.average(vibration(rng), RATE, tach(rng)[0], orders=[19.0], trigger_cycles=40,
                              correct_jitter=True, keyphasor_rate=3000.0)
     known = np.full(41, 1e-5)
+
     def drawn():
         errors = rng.normal(0.0, np.hypot(1.0, scatter) * 1e-5, 41)
         errors -= errors.mean()
