@@ -91,7 +91,7 @@ def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
 @pytest.mark.parametrize(('count', 'turn', 'shape'), [
     (20, 0.3, 'normal'), (40, 0.6, 'uniform'),
     pytest.param(20, 0.6, 'uniform', marks=pytest.mark.machines),
-    pytest.param(40, 0.3, 'normal', marks=pytest.mark.machines)])
+    pytest.param(40, 0.6, 'normal', marks=pytest.mark.machines)])
 def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
     """The correction tells the size and the kurtosis of the pulse errors, and the noise."""
     trials, rng, noise = 400, np.random.default_rng(count + int(10 * turn)), 0.01
