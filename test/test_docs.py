@@ -197,7 +197,7 @@ def run_python(block):
 
 
 PYTHON = [block for block in BLOCKS if block.language == 'python']
-LONG = {'adding_an_effect.md', 'check_keyphasor.md', 'tacholess.md'}  # trace whole machines
+LONG = {'adding_an_effect.md', 'tacholess.md'}  # trace whole machines
 FIGURES = [(block.document, name) for block in PYTHON
            for name in re.findall(r"savefig\('([\w.-]+)'", block.text)]
 
