@@ -51,8 +51,8 @@ _OF_A_ROW = 4  # numbers, in a sample
 #: Rows that take more than 2 s, of which no sample asks.
 _SLOW = ('damaged drifting 0', 'damaged fading 0', 'damaged short 0',
          'independent excess_jitter 4', 'independent interfering_tone 0',
-         'independent late_recovery 0', 'independent resonance 2',
-         'independent speed_fluctuation 0')
+         'independent clock_skew 0', 'independent late_recovery 0', 'independent resonance 2',
+         'independent speed_fluctuation 0', 'lost 5 samples 0')
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ os.environ['ROS_HOME'] = os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='sa
 atexit.register(shutil.rmtree, os.environ['ROS_HOME'], ignore_errors=True)
 
 use_one_thread()
-settings.register_profile('repeatable', deadline=None, derandomize=True)
+settings.register_profile('repeatable', deadline=None, derandomize=True, max_examples=40)
 settings.load_profile('repeatable')
 
 ROOT = Path(__file__).resolve().parents[1]

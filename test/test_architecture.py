@@ -12,6 +12,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 import re
 import subprocess
@@ -94,9 +95,15 @@ def room_of(path):
     return name_of(path).partition('.')[0]
 
 
+@cache
+def nodes_of(path):
+    """Return all nodes of the syntax tree of a file, its module first."""
+    return list(ast.walk(ast.parse(path.read_text(encoding='utf-8'))))
+
+
 def imports(path):
     """Yield the absolute name of everything a module imports, wherever in it the import stands."""
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -185,7 +192,7 @@ def test_no_two_classes_have_one_name():
     """A simulated effect has the name of the effect, beside which it stands in the docs."""
     homes = defaultdict(list)
     for path in MODULES:
-        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+        for node in nodes_of(path)[0].body:
             if isinstance(node, ast.ClassDef) and room_of(path) != 'simulation':
                 homes[node.name].append(name_of(path))
     assert {name: found for name, found in homes.items() if len(found) > 1} == {}
@@ -223,8 +230,7 @@ def test_distributions_take_no_time_to_load(module):
 @pytest.mark.parametrize('path', MODULES, ids=name_of)
 def test_core_does_not_print(path):
     called = {
-        node.func.id
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        node.func.id for node in nodes_of(path)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
     }
     assert 'print' not in called or room_of(path) not in CORE

@@ -13,8 +13,9 @@
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
-from sa_jitter_ros.averaging.amplitude_errors import (kurtosis_of, Repeatability, Scatter,
-                                                      upper_limit)
+from sa_jitter_ros.averaging.amplitude_errors import (
+    _Jittered, AmplitudeErrors, corrected_errors, kurtosis_of, Repeatability, Scatter, upper_limit,
+    waveform_error)
 
 ORDERS = np.array([16.0, 32.0, 8.0, 5.0, 11.0])  # strong, three times; absent; 10 dB weak
 AMPLITUDES = np.array([1.0, 0.3, 0.5, 0.0, 0.0])
@@ -36,8 +37,8 @@ def cycles_of(rng, count, *, noise, turn, orders=ORDERS, weak=None, errors=None)
     if errors is None:
         errors = rng.uniform(-1.0, 1.0, count + 1) * np.sqrt(3.0)
     errors = errors * turn / (2.0 * np.pi * orders[0])
-    u = np.linspace(0.0, 1.0, 257)
-    weight = np.full(u.size, 1.0 / 256) * np.where((u == 0.0) | (u == 1.0), 0.5, 1.0)
+    u = np.linspace(0.0, 1.0, 129)
+    weight = np.full(u.size, 1.0 / 128) * np.where((u == 0.0) | (u == 1.0), 0.5, 1.0)
     angle = u + errors[:-1, None] * (1.0 - u) + errors[1:, None] * u
     wave = np.einsum('k,kcu->cu', true, np.exp(
         2j * np.pi * orders[:, None, None] * angle)).real
@@ -58,7 +59,9 @@ def hold(found, trials):
 
 
 @pytest.mark.parametrize(('count', 'noise', 'turn'), [
-    (6, 0.01, 0.3), (10, 0.01, 0.02), (10, 0.05, 0.3), (40, 0.01, 0.8), (160, 0.01, 0.3)])
+    (6, 0.01, 0.3), (10, 0.01, 0.02), (10, 0.05, 0.3),
+    pytest.param(40, 0.01, 0.8, marks=pytest.mark.machines),
+    pytest.param(80, 0.01, 0.3, marks=pytest.mark.machines)])
 def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
     trials, rng = 400, np.random.default_rng(count)
     means, along, phase, upper, turned = [], [], [], [], []
@@ -85,8 +88,10 @@ def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
     assert np.all(limits[:, ABSENT] > 0.0)
 
 
-@pytest.mark.parametrize(('count', 'turn'), [(20, 0.3), (40, 0.6)])
-@pytest.mark.parametrize('shape', ['uniform', 'normal'])
+@pytest.mark.parametrize(('count', 'turn', 'shape'), [
+    (20, 0.3, 'normal'), (40, 0.6, 'uniform'),
+    pytest.param(20, 0.6, 'uniform', marks=pytest.mark.machines),
+    pytest.param(40, 0.6, 'normal', marks=pytest.mark.machines)])
 def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
     """The correction tells the size and the kurtosis of the pulse errors, and the noise."""
     trials, rng, noise = 400, np.random.default_rng(count + int(10 * turn)), 0.01
@@ -127,6 +132,7 @@ def test_errors_of_a_sideband_hold_what_jitter_leaks_into_the_mean(count, turn, 
     assert hold(shares((size - np.mean(size)) / along), trials).all()
 
 
+@pytest.mark.machines
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 def test_corrected_errors_are_the_distance_from_the_truth():
     """Also of the phase, which the mean of the pulse errors turns, and which no one can know."""
@@ -155,6 +161,7 @@ def test_corrected_errors_are_the_distance_from_the_truth():
     assert np.all(np.mean(limits, axis=0) > 0.92 - 3.0 * np.sqrt(0.05 * 0.95 / trials))
 
 
+@pytest.mark.machines
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 @pytest.mark.parametrize(
     ('count', 'turn', 'ratio'), [(10, 0.3, 1.0), (40, 0.8, 1.0), (10, 0.3, 2.4)])
@@ -211,3 +218,106 @@ def test_errors_of_one_cycle_of_silence_and_above_nyquist_are_no_numbers():
     for item in (errors.amplitude, errors.phase, errors.upper_95):
         assert np.isnan(item[:, 2]).all()
         assert np.isfinite(item[:, :2]).all()
+
+
+@pytest.mark.parametrize(('count', 'length'), [(100, 1.0), (40, 2.5)])
+def test_neighbouring_cycles_share_what_a_pulse_moves(count, length):
+    """The variance of the mean beyond that of independent cycles, for any place in the cycle."""
+    place = (np.arange(0.0, length, length / 200)[:, None] + np.arange(count)) / length
+    moved = np.maximum(1.0 - abs(place[:, None] - np.arange(place.max() + 2.0)[:, None]), 0.0)
+    alone = np.sum(np.mean(moved, axis=2) ** 2 - np.mean(moved**2, axis=2) / count, axis=1)
+    wave = np.cos(2.0 * np.pi * np.arange(64) / 64)[:, None]
+    error = waveform_error(wave, np.zeros(wave.shape), count, 0.01, length)
+    # between the neighbours of a point, 2 of 64 steps apart, the steepest slope is 0.9984 of it
+    steepest = 0.01 * 2.0 * np.pi * 0.9984
+    assert error.max() == pytest.approx(steepest * np.sqrt(alone.mean()), rel=2e-3)
+
+
+def test_limits_go_as_far_as_either_kind_of_jitter_takes_and_no_farther():
+    amplitude, noise = np.ones((1, 1)), np.full((1, 1), 1e-3)
+    u = (np.arange(400) + 0.5) / 400
+    for turn in (1.0, 2.5, 20.0):
+        errors = Repeatability(np.ones(1), noise, noise, turn / (2.0 * np.pi)).errors(amplitude)
+        normal = np.mean(np.exp(-0.5 * turn**2 * (u**2 + (1.0 - u) ** 2)))
+        uniform = np.mean(np.sinc(np.sqrt(3.0) / np.pi * turn * u)
+                          * np.sinc(np.sqrt(3.0) / np.pi * turn * (1.0 - u)))
+        left = max(min(normal, uniform), 0.02)
+        assert errors.upper_95[0, 0] == pytest.approx(1.0016 / left, rel=1e-3)
+
+
+def test_degrees_of_freedom_are_those_of_the_noise(rng):
+    """Of a strong order along the radius, of an absent one in any direction."""
+    for count in (10, 60, 61):
+        noise = rng.standard_normal((count, 1, 2, 2)) @ (1.0, 1.0j)
+        cycles = (5.0, 0.0) + 0.1 * (noise - noise.mean(axis=0))
+        freedom = Scatter.of(cycles, cycles).freedom[0]
+        assert freedom[0] == pytest.approx(count - 1, abs=1.0)
+        assert freedom[1] == pytest.approx(2 * (count - 1), abs=2.0)
+
+
+@pytest.mark.parametrize('ratio', [0.2, 0.5, 0.7])
+def test_errors_of_a_phase_hold_down_to_noise_as_large_as_the_amplitude(rng, ratio):
+    noise = ratio * (rng.standard_normal((20_000, 1, 2)) @ (1.0, 1.0j))
+    found = AmplitudeErrors.of(1.0 + noise, np.full(noise.shape, ratio),
+                               np.full(noise.shape, ratio))
+    assert hold(shares(np.angle(1.0 + noise) / found.phase), 20_000).all()
+
+
+@pytest.mark.parametrize('count', [2, 5, 30])
+def test_the_mean_of_all_pulse_errors_turns_the_corrected_phase(count):
+    cycles = np.ones((count, 1, 3), complex)
+    errors = corrected_errors(
+        Scatter.of(cycles, cycles), np.array([1.0, 8.0, 20.0]), amplitudes=cycles[0],
+        unsure=np.zeros((1, 3)), largest=np.ones((1, 3)), jitter=1e-4)
+    pulses = count + 1.0
+    np.testing.assert_allclose(errors.phase[0], 2e-4 * np.pi * np.array([1.0, 8.0, 20.0])
+                               / np.sqrt(pulses), rtol=1e-3)
+
+
+def test_what_turns_a_phasor_does_not_make_its_size_uncertain(rng):
+    """Phases scatter from cycle to cycle by more than the pulses do, whose jitter is known."""
+    count, noise = 60, 1e-3
+    turned = np.exp(0.1j * rng.standard_normal((count, 1, 1)))
+    white = noise * (rng.standard_normal((count, 1, 1, 2)) @ (1.0, 1.0j))
+    cycles = turned + white
+    found = Repeatability.of(cycles, cycles, np.array([16.0]), jitter=1e-4)
+    radial = (cycles * np.exp(-1j * np.angle(cycles.mean(axis=0)))).real
+    assert found.along[0, 0] == pytest.approx(radial.std() / np.sqrt(count), rel=0.25)
+
+
+@pytest.mark.parametrize('phase', [1.0, 2.5])
+def test_orders_that_jitter_leaks_into_the_same_place_add_with_their_phases(rng, phase):
+    """An absent order between two strong ones, whose cycles show the noise beside the leakage."""
+    orders, count, std, noise = np.array([15.0, 16.0, 17.0]), 4000, 0.003, 0.02
+    true = np.array([[1.0, 0.0, 0.7 * np.exp(1j * phase)]])
+    u = (np.arange(64) + 0.5) / 64
+    errors = std * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, count + 1)
+    angle = u + errors[:-1, None] * (1.0 - u) + errors[1:, None] * u
+    wave = np.tensordot(true[0], np.exp(2j * np.pi * orders[:, None, None] * angle), axes=1)
+    cycles = (wave.real @ np.exp(-2j * np.pi * np.outer(u, orders)) / 32)[:, None]
+    jittered = _Jittered.of(true, orders, std**2, 1.8, 1.0, whole=True)
+    apart = cycles - cycles.mean(axis=0)
+    for lag, (both, lean) in enumerate(zip(jittered.both, jittered.lean)):
+        first, second = apart[:count - lag], apart[lag:]
+        near = 0.2 * jittered.both[0]
+        assert np.all(abs(both - np.mean(np.conj(first) * second, axis=0).real) < near)
+        assert np.all(abs(lean - np.mean(first * second, axis=0)) < near)
+    cycles += noise * (rng.standard_normal((*cycles.shape, 2)) @ (1.0, 1.0j))
+    found, freedom = jittered.noise_beside(
+        Scatter.of(cycles, cycles), np.exp(1j * np.angle(cycles.mean(axis=0))))
+    assert np.all(abs(found / noise**2 - 1.0) < 4.0 * np.sqrt(2.0 / freedom))
+    assert np.all(freedom[0, [0, 2]] < count)
+
+
+@pytest.mark.parametrize('kurtosis', [1.8, 3.0])
+def test_what_turns_all_cycles_together_does_not_shorten_their_mean(rng, kurtosis):
+    count, std, true = 3, 0.004, np.ones((1, 1))
+    draw = (rng.standard_normal((20_000, count + 1)) if kurtosis == 3.0
+            else np.sqrt(3.0) * rng.uniform(-1.0, 1.0, (20_000, count + 1)))
+    begin, change = std * draw[:, :-1], std * np.diff(draw)
+    mean = np.mean(np.exp(2j * np.pi * 10.0 * (begin + 0.5 * change)) * np.sinc(10.0 * change),
+                   axis=1)
+    along, across = _Jittered.of(true, np.array([10.0]), std**2, kurtosis, 1.0, whole=True
+                                 ).of_mean(np.ones((1, 1)), count)
+    assert along[0, 0] == pytest.approx(np.var(abs(mean)), rel=0.1)
+    assert across[0, 0] == pytest.approx(np.var(mean.imag), rel=0.1)

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.averager_parameters import PARAMETERS, shaft_parameters
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.pulses.resampling import interpolator_gain, METHODS
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
@@ -204,6 +205,7 @@ def test_parameters_that_cannot_be_used_are_refused(options, text):
 
 @pytest.mark.parametrize(('vibration', 'pulses', 'text'), [
     (VIBRATION.T, PULSES, '4000 channels of 2 samples'),
+    (VIBRATION[:1].T, PULSES, '4000 channels of 1 samples'),
     (VIBRATION[None], PULSES, 'shape'), (VIBRATION.astype(complex), PULSES, 'complex'),
     (['a', 'b'], PULSES, 'real numbers'), (VIBRATION, ['a'], 'real numbers'),
     (VIBRATION, PULSES[None], 'pulse times have'), (VIBRATION, [], 'make 0 whole'),
@@ -374,6 +376,8 @@ def test_defaults_are_those_of_the_node():
               if shown[name] != known[name] and (shown[name] or known[name])}
     assert shown.keys() - known.keys() == {'machine', 'shaft'}  # of the machine file in the node
     assert differ == {'sample_rate', 'orders', 'trigger_cycles', 'buffer_seconds'}
+    for name in ('buffer_seconds', 'time_tolerance'):
+        assert getattr(VibrationTimeline(), name) == known[name]
 
 
 def test_an_unknown_keyword_is_named_with_the_one_it_looks_like():

@@ -87,6 +87,7 @@ def test_later_averages_whose_cycles_leak_are_as_near_as_the_first():
     assert np.all(raw < 2.0 * raw[0])
 
 
+@pytest.mark.machines
 def test_attenuation_is_that_of_the_noiseless_machine_within_its_error():
     ratio = 2.40789
     noisy = averages_of(gearbox(ratio, noise=1.0), ratio=ratio, seconds=30.0)
@@ -102,6 +103,7 @@ def test_attenuation_is_that_of_the_noiseless_machine_within_its_error():
     assert 0.6 < np.std(z) < 1.6
 
 
+@pytest.mark.machines
 def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds():
     """Order 24 is not there, 27 stands 6 dB above the noise of the average, 19 20 dB."""
     orders, size = np.array([19.0, 24.0, 27.0]), np.array([1.0, 0.0, 0.2])
@@ -130,6 +132,7 @@ def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds()
     assert change.mean() < 0.02 * raw.mean() + 3.0 * change.std() / np.sqrt(80.0)
 
 
+@pytest.mark.machines
 def test_attenuation_of_five_cycles_has_a_standard_error_that_holds():
     orders, size, cycles, trials = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3]), 5, 120
     rng, rate, std = np.random.default_rng(8), 160.0 * SPEED, 0.3 / (2.0 * np.pi * 16.0 * SPEED)
@@ -153,6 +156,7 @@ def test_attenuation_of_five_cycles_has_a_standard_error_that_holds():
         assert np.mean(np.abs(z) < width) == pytest.approx(wanted, abs=0.03 + 3.0 * error)
 
 
+@pytest.mark.machines
 def test_noise_does_not_raise_what_errors_leave_uncertain():
     found = averages_of(gearbox(2.40789, noise=6.0), ratio=2.40789, seconds=40.0)
     raw, corrected = (np.abs([item.amplitudes[0] for item in items]) for items in (
@@ -183,6 +187,7 @@ def test_noise_alone_is_not_changed():
         correction = average.correction
         assert not correction.accepted
         assert correction.reason
+        assert correction.refitted == 0
         np.testing.assert_array_equal(
             correction.waveform, average.waveform)
 
@@ -276,6 +281,7 @@ def test_measured_gearbox_with_a_slow_keyphasor(shared_data):
         np.testing.assert_allclose(ratio[:, 3], 1.0, atol=0.015)
 
 
+@pytest.mark.machines
 def test_an_order_that_the_correction_makes_smaller_is_corrected_too(rng):
     """Errors may turn a leaking order so that it reads too large."""
     corrected, raw, true = [], [], []
@@ -299,6 +305,7 @@ def test_an_order_that_the_correction_makes_smaller_is_corrected_too(rng):
     assert np.mean((corrected - true) ** 2) < 0.5 * np.mean((raw - true) ** 2)
 
 
+@pytest.mark.machines
 def test_shafts_that_are_due_together_are_corrected_as_each_alone(monkeypatch):
     machine, made = gearbox(2.0, noise=0.3), []
     shafts = {'shaft': {'cycle_length': 2.0}, 'tach': {'orders': (38.0,)},
@@ -330,6 +337,7 @@ def test_shafts_that_are_due_together_are_corrected_as_each_alone(monkeypatch):
                                        alone.correction.pulse_errors, rtol=1e-7, atol=1e-13)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('cycles', [40, 120])
 def test_amplitudes_beside_the_lines_of_another_shaft_are_not_biased(cycles):
     """Its lines turn the recovered errors slowly, and not as white noise does."""

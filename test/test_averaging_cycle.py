@@ -11,11 +11,14 @@
 """Order amplitudes of single trigger cycles against the integrals that define them."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
+import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.average import AverageSettings
-from sa_jitter_ros.averaging.cycle import CycleSamples, has_same_angles, joined_cycles
+from sa_jitter_ros.averaging.cycle import (
+    CycleSamples, exact_cycles, has_same_angles, joined_cycles)
 from sa_jitter_ros.averaging.shaft import average_cycles
 
 RATE, SPEED, CYCLES, START = 10e3, 10.0, 36, 0.0123
@@ -67,3 +70,30 @@ def test_cycles_are_joined_to_the_samples_that_they_were_cut_from(layout, rng):
     np.testing.assert_array_equal(run.samples, samples[41:361])
     assert np.shares_memory(run.samples, samples) == (layout != 'copies')
     assert run.count == 3
+
+
+@pytest.mark.parametrize('ratio', [np.sqrt(2.0), np.pi / 2.0, 1.0 / 3.0 + 1e-13])
+def test_a_ratio_that_is_none_of_numbers_of_teeth_is_exactly_its_float(ratio):
+    assert exact_cycles(float(ratio)) == Fraction(float(ratio))
+
+
+@pytest.mark.parametrize(('place', 'cycles'), [(0, [0]), (9, [0]), (980, [0]), (1000, [0, 1]),
+                                               (1500, [1]), (2040, [1])])
+def test_a_channel_lacks_the_cycles_that_a_gap_is_in_or_beside(place, cycles):
+    samples = np.ones((2100, 2))
+    samples[place, 1] = np.nan
+    run = CycleSamples(samples, 0.0, 1000.0, np.array([0.02, 1.02, 2.02]), 0, count=2)
+    found = run.without_gaps()
+    assert [number for number, channels in enumerate(found.lacking) if channels] == cycles
+    assert {channels for channels in found.lacking if channels} == {(1,)}
+    assert found.samples.sum() == 4199.0
+
+
+@pytest.mark.parametrize('ratio', [1.0, 2.40789])
+def test_a_coarse_waveform_takes_nothing_from_orders_above_it(ratio):
+    turn = 2.0 * np.pi * ratio * 10.0 * np.arange(4000) / 2000.0
+    average, = sa.average(np.cos(30.0 * turn) + 3.0 * np.cos(2.0 * turn), 2000.0,
+                          np.arange(1.0, 19.0) / 10.0, ratio=ratio, orders=[30.0],
+                          samples_per_revolution=16)
+    assert average.waveform.shape == (1, 16)
+    assert abs(average.amplitudes[0, 0]) == pytest.approx(1.0, abs=5e-3)

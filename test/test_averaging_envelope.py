@@ -13,6 +13,7 @@
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.envelope import EnvelopeSettings
 from sa_jitter_ros.averaging.results import ENVELOPE_FIELDS, ShaftResults, SPECTRUM_FIELDS
 from sa_jitter_ros.errors import ParameterError
 
@@ -117,3 +118,11 @@ def test_tables_name_their_fields():
 def test_wrong_settings_are_refused(options, reason):
     with pytest.raises(ParameterError, match=reason):
         sa.Averager(RATE, **options)
+
+
+@pytest.mark.parametrize('revolutions', [30.0, 1e7])
+def test_a_spectrum_reaches_beyond_every_bearing_order_in_a_bounded_number_of_lines(revolutions):
+    orders = EnvelopeSettings([4.9, 11.3]).orders(revolutions)
+    assert 100 < orders.size <= 8192
+    assert 1.2 * 11.3 < orders[-1] < 1.3 * 11.3
+    assert np.ptp(np.diff(orders)) < 1e-9

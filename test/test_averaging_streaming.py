@@ -22,11 +22,13 @@ import pytest
 from sa_jitter_ros.averaging.amplitude_errors import widened
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING
 from sa_jitter_ros.averaging.cycle import CycleSamples
+from sa_jitter_ros.averaging.recovered_marks import RecoveredMarks
 from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.resampling import interpolator_gain
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.samples import SampleBlock
 
@@ -83,7 +85,7 @@ def assert_same(found, expected):
                     rtol=1e-9, atol=1e-11, err_msg=f'{name} {key}')
 
 
-@pytest.mark.parametrize('examples', [15, pytest.param(30, marks=pytest.mark.machines)])
+@pytest.mark.parametrize('examples', [5, pytest.param(25, marks=pytest.mark.machines)])
 def test_averages_are_the_same_for_every_cut_and_order_of_arrival(examples):
     @settings(max_examples=examples)
     @given(st.data())
@@ -880,3 +882,14 @@ def test_cycles_averaged_together_are_those_averaged_alone(law, rng):
         np.testing.assert_allclose(other.waveform, together.waveform, atol=1e-14)
         np.testing.assert_allclose(other.standard_error, together.standard_error, atol=1e-14)
         np.testing.assert_allclose(other.cycle_amplitudes, together.cycle_amplitudes, atol=1e-14)
+
+
+def test_marks_are_known_by_the_vibration_only_as_far_as_their_errors_show_them():
+    marks, even = np.tile(np.arange(4), 50), MarkOffsets(*np.zeros((2, 4)))
+    shift = 5e-3 * np.array([1.0, -1.0, 1.0, -1.0])
+    for late, known in ((0.0 * shift, False), (shift, True)):
+        seen = RecoveredMarks(4)
+        seen._update(marks, late[marks], np.full(200, 1e6))  # 1 mrad each
+        found = seen.added_to(even, np.arange(4))
+        assert found.by_vibration == known
+        np.testing.assert_allclose(found.angles, late, rtol=1e-3)

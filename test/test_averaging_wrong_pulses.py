@@ -94,4 +94,5 @@ def test_a_clock_that_runs_away_is_named_with_its_size(machine, skew):
     word = 'late' if skew > 0.0 else 'early'
     assert line.startswith(f'shaft: the pulses come {word} by ')
     size = float(line.rpartition('differ by ')[2].removesuffix(' ppm'))
+    assert f'by {size:.3g} us more every second' in line
     assert size == pytest.approx(1e6 * abs(skew), abs=15.0)

@@ -93,6 +93,7 @@ def test_machine_file_starts_every_node(name, written, recording, ros_graph):
         assert node.get_parameter(key).value == value
 
 
+@pytest.mark.machines
 def test_machine_file_declares_the_machine_to_the_commands(written, recording, capsys):
     machine = written / 'machine.yaml'
     declaration = read_declaration(machine)
@@ -120,6 +121,7 @@ jitter_predictor:
 """
 
 
+@pytest.mark.machines
 def test_machine_file_keeps_the_parts(recording, tmp_path, ros_graph):
     declared, found = tmp_path / 'declared.yaml', tmp_path / 'out' / 'machine.yaml'
     declared.write_text(PARTS)
@@ -140,6 +142,7 @@ def test_machine_file_keeps_the_parts(recording, tmp_path, ros_graph):
     assert node.get_parameter('pulses_per_revolution').value == 12
 
 
+@pytest.mark.machines
 def test_machine_file_is_compared_with_what_is_found(recording, tmp_path):
     (tmp_path / 'machine.yaml').write_text(
         '/**/jitter_predictor:\n  ros__parameters:\n    pulses_per_revolution: 50\n'

@@ -65,6 +65,7 @@ def test_the_table_is_what_the_library_chooses(tmp_path, capsys, name):
     assert output.read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.machines
 def test_given_settings_are_assessed(tmp_path, capsys):
     output = tmp_path / 'design.svg'
     assert design.main([*BENCH, '--keyphasor-rate', '5000', '--trigger-cycles', '41',
@@ -80,6 +81,7 @@ def test_given_settings_are_assessed(tmp_path, capsys):
     assert svg.count('<path') > 20
 
 
+@pytest.mark.machines
 def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, capsys):
     sizes = []
     for arguments in ([], ['--others', '18.6886', '--tones', '50', '1850', '--change', '-0.05',
@@ -120,6 +122,7 @@ def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
         assert [line.removeprefix('    ') for line in printed.strip('\n').splitlines()] == lines
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('orders', [['0.001'], ['38', '100']])
 def test_figure_of_orders_without_iso_lines_and_of_pulses_that_could_swap(
         tmp_path, capsys, orders):

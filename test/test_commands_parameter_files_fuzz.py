@@ -62,7 +62,7 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp('models')
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(st.dictionaries(st.sampled_from(NAMES), VALUES, max_size=3))
 @example({'keyphasor_rate': 10**400})
 @example({'effects.excess_jitter.enabled': True, 'effects.excess_jitter.std': [1.0]})
@@ -72,13 +72,13 @@ def test_any_values_of_the_parameters(folder, values):
     check(folder, yaml.safe_dump({'/**': {'ros__parameters': {**enabled, **values}}}))
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(DOCUMENTS)
 def test_any_document(folder, document):
     check(folder, yaml.safe_dump(document))
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.text(alphabet='ab:-[]{}&*!|>?#"\'%@,\n 1.e', max_size=60))
 def test_any_text(folder, text):
     check(folder, text)

@@ -197,13 +197,14 @@ def run_python(block):
 
 
 PYTHON = [block for block in BLOCKS if block.language == 'python']
+LONG = {'adding_an_effect.md', 'tacholess.md'}  # trace whole machines
 FIGURES = [(block.document, name) for block in PYTHON
            for name in re.findall(r"savefig\('([\w.-]+)'", block.text)]
 
 
 @pytest.mark.parametrize('document', [
-    item for item in DOCUMENTS if any(block.document == item for block in PYTHON)],
-    ids=lambda document: document.name)
+    pytest.param(item, id=item.name, marks=[pytest.mark.machines] * (item.name in LONG))
+    for item in DOCUMENTS if any(block.document == item for block in PYTHON)])
 def test_python_runs_and_prints_what_the_document_shows(document):
     for block in PYTHON:
         if block.document == document and not block.reason:
@@ -356,6 +357,7 @@ TUTORIAL = ROOT / 'docs' / 'tutorial.md'
 DAY = '## 9. A day with an own gearbox'
 
 
+@pytest.mark.machines
 def test_a_day_with_an_own_gearbox_can_be_spent(capsys, ros_graph):
     """All of its commands run, in their order, and print what is shown."""
     begins = TUTORIAL.read_text(encoding='utf-8').splitlines().index(DAY)

@@ -23,7 +23,9 @@ MODULES = ['.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts)
            or '\n>>> ' in path.read_text('utf-8')]
 
 
-@pytest.mark.parametrize('name', MODULES)
+@pytest.mark.parametrize('name', [
+    pytest.param(name, marks=[pytest.mark.machines] * (name == 'sa_jitter_ros.loop'))
+    for name in MODULES])
 def test_examples_of_a_module(name):
     module = import_module(name.removesuffix('.__init__'))
     found = doctest.testmod(module)

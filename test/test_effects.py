@@ -437,6 +437,7 @@ def test_modulation_leaves_the_mean_and_widens_all_orders_alike():
     assert spread == pytest.approx(np.full(3, spread[0]), rel=0.04)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('cycles', [40, 200, 1000])
 def test_slow_motions_keep_their_spectrum_in_long_averages(cycles):
     model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e12, 'trigger_cycles': cycles,

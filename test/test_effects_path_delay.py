@@ -60,6 +60,7 @@ def test_delay_turns_with_the_speed_and_attenuates_where_it_changes():
     np.testing.assert_allclose(np.exp(1j * turns), np.exp(1j * wanted), atol=5e-3)
 
 
+@pytest.mark.machines
 def test_delay_and_jitter_have_the_predicted_mean_and_scatter():
     """Jitter is also in the speeds from which the delay's errors are predicted."""
     z, parts = [], []

@@ -124,6 +124,7 @@ def test_recordings_by_different_clocks_are_refused(tmp_path, capsys, clock, gri
     assert not (tmp_path / 'out').exists()
 
 
+@pytest.mark.machines
 def test_gaps_cannot_be_identified_with_a_curved_angle_law():
     model = replace(MODEL, jitter_distribution='uniform', angle_law='spline')
     recording = machine(acquisitions=6, missing_pulses={'probability': 0.02})

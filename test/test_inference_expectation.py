@@ -91,6 +91,7 @@ def expected(model, effects, pulses):
                   [[item] for item in pulses], np.zeros(3, int), range(len(pulses)))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
 @pytest.mark.parametrize('cycles', [5, 40])
 @pytest.mark.parametrize('name', EFFECTS)

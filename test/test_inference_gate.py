@@ -99,6 +99,7 @@ def test_effects_go_the_least_supported_first(rng):
     assert not found.worse
 
 
+@pytest.mark.machines
 def test_trace_with_effects_that_harm_can_not_be_made():
     vibration, pulses = machine(*make_effects({'excess_jitter': {'std': 1.5e-4}}))
     recording = Recording(ArraySource(vibration), RATE, pulse_times=pulses)

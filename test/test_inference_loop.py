@@ -83,6 +83,7 @@ def traced(*effects, declared=(), **options):
     return trace(*observed(*effects, **options), declared=declared)
 
 
+@pytest.mark.machines
 def test_order_that_is_declared_twice_counts_once():
     recording = simulated(acquisitions=8)
     twice = replace(MODEL, orders=(8.0, 16.0, 8.0, 24.0, 32.0, 16.0))
@@ -109,6 +110,7 @@ def test_observation_finds_the_true_errors_and_attenuation():
     assert np.all(np.diff(mean, axis=1) < 0.0)
 
 
+@pytest.mark.machines
 def test_reference_keyphasor_is_used_unless_the_source_moves_relative_to_it():
     wander = make_effects({'phase_wander': {'std': 0.02}})
     moved = observe(simulated(*wander, acquisitions=4, reference=True), MODEL)
@@ -415,6 +417,7 @@ def test_measured_gearbox_needs_the_phases_of_its_pulses(shared_data):
     assert content['error_after']['rms'] < 0.015
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', ['motor_10V_100kHz.npz', 'uia_bearing_rig_1.npz'])
 def test_recording_that_hides_its_pulse_errors_says_what_it_cannot_exclude(shared_data, name):
     recording = read(shared_data / name)
@@ -439,6 +442,7 @@ def test_recording_that_hides_its_pulse_errors_says_what_it_cannot_exclude(share
     assert 0.0 < upper['missing_pulses'] < 0.2  # which the pulse times show
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('day', 'skew', 'orders', 'share'), [
     (20130331, 1.4e-4, (40.0,), 1.0), (20130405, 0.0, (20.0, 40.0), 0.5)])
 def test_turbine_whose_lines_come_and_go_has_no_limit_of_what_they_do_not_hold(
@@ -479,6 +483,7 @@ def test_noise_that_hides_the_pulse_errors_is_found():
     assert std['value'] == pytest.approx(np.sqrt(1.5**2 - 0.5**2), abs=3.5 * std['standard_error'])
 
 
+@pytest.mark.machines
 def test_pulse_times_alone_show_lost_pulses(rng, tmp_path):
     whole = noise_alone(rng)
     recording = replace(whole, pulse_times=np.delete(whole.pulse_times, [20, 41, 42, 77]))
@@ -615,6 +620,7 @@ def test_a_dead_channel_changes_nothing():
     assert set(found.lines.channel.tolist()) == {0}
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('made', 'model', 'reason'), [
     (lambda rng: simulated(acquisitions=2), MODEL, '2 acquisitions of 20 trigger cycles'),
     (lambda rng: simulated(acquisitions=8), changed(orders=(11.3, 17.7)),

@@ -82,6 +82,7 @@ def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
         validated(np.sort(np.append(true, true[10::12] + 0.01 / marks)), marks)
 
 
+@pytest.mark.machines
 def test_pulses_may_be_missing_in_every_acquisition():
     recording = simulated(acquisitions=14)
     lost = np.delete(recording.pulse_times, np.arange(7, recording.pulse_times.size, 13))
@@ -123,6 +124,7 @@ def test_trigger_pulses_of_a_wheel_with_gaps_stay_on_its_teeth():
     assert not found.missing.any()
 
 
+@pytest.mark.machines
 def test_double_pulses_are_no_effect():
     """They take acquisitions, not the verdict."""
     recording = simulated(acquisitions=18)
@@ -166,6 +168,7 @@ def delayed(recording, late):
     return replace(recording, pulse_times=times + np.resize(late, times.size))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'step'), [(4, 4), (4, 1)])
 def test_errors_that_repeat_with_no_revolution_are_no_target(marks, step):
     """They are a hum's, say, and the reader sees that they repeat."""
@@ -177,6 +180,7 @@ def test_errors_that_repeat_with_no_revolution_are_no_target(marks, step):
     assert found.left.direction == 'pulses'
 
 
+@pytest.mark.machines
 def test_errors_that_repeat_with_the_revolution_are_a_target():
     recording, model = geared(4, 1)
     truth = np.array([2e-4, -1e-4, 0.0, -1e-4])
@@ -186,6 +190,7 @@ def test_errors_that_repeat_with_the_revolution_are_a_target():
     assert np.abs(off).max() < 4.0 * finding.standard_errors['pulse_angles'][0]
 
 
+@pytest.mark.machines
 def test_nothing_is_known_of_marks_that_begin_no_cycle():
     recording, model = geared(4, 2)
     (finding,) = traced(delayed(recording, [2e-4, 0.0, -2e-4, 0.0]), model).findings
@@ -203,6 +208,7 @@ def test_declared_ratio_may_be_written_with_six_digits():
         record_pulses(replace(recording, ratio=183 / 76), replace(MODEL, ratio=2.408))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('rate', 'said'), [(10_000.0, True), (5_000.0, False), (5_040.0, False)])
 def test_another_rate_of_the_tach_is_remarked(rate, said):
     recording = replace(simulated(), tach_rate=5_000.0)

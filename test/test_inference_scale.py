@@ -80,6 +80,7 @@ def test_small_unexplained_scatter_is_unsteadiness(recording, observation, rng):
     assert found.after.ks < 1.63 / np.sqrt(count // 2)
 
 
+@pytest.mark.machines
 def test_levels_of_few_averages_are_part_of_the_scale(recording, observation, rng):
     few = replace(observation, acquisitions=observation.acquisitions[:8])
     size, found = 0.02, []

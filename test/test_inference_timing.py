@@ -57,6 +57,7 @@ CASES = {
 }
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', CASES)
 def test_effect_is_found_with_its_size(name):
     sizes, (parameter, truth) = CASES[name]
@@ -93,6 +94,7 @@ def without_the_middle(stretch):
         for part in (slice(0, third), slice(2 * third, 3 * third))]
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('sizes', 'name'), [
     ({}, ''), ({'swing': 2e-3}, ''), ({'excess': 1.0, 'rho': 0.7}, 'correlated_jitter'),
     ({'wander': 2.0, 'band': (0.0, 0.2)}, 'phase_wander')])
@@ -109,6 +111,7 @@ def test_what_sets_stretches_apart_has_the_power_of_its_frequency(sizes, name):
     assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 3.0 / count) + 0.1)
 
 
+@pytest.mark.machines
 def test_a_skew_shows_on_either_side_of_what_is_held_out():
     parts = without_the_middle(machine(7, skew=3e-6))
     timing = read_timing(parts)
@@ -122,6 +125,7 @@ def test_a_skew_shows_on_either_side_of_what_is_held_out():
     assert error < 1.3 * value_of(whole, 'clock_skew', 'skew')[1]
 
 
+@pytest.mark.machines
 def test_a_delay_shows_on_either_side_of_what_is_held_out():
     """The turn that all pulses have in common is that of the whole fit, not of a part of it."""
     for seed in range(2):
@@ -133,6 +137,7 @@ def test_a_delay_shows_on_either_side_of_what_is_held_out():
         assert error < 1.5 * value_of(read_timing([whole]), 'path_delay', 'delay')[1]
 
 
+@pytest.mark.machines
 def test_independent_errors_beside_a_slow_motion_have_no_memory():
     """Errors with a memory explain both at first, so that jitter begins in their place."""
     timing = read_timing([machine(
@@ -150,6 +155,7 @@ def test_a_beat_within_the_cycles_is_no_acceleration(rng):
     assert 'speed_fluctuation' not in {item.name for item in timing.findings}
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('noise', [0.02, 0.3])
 def test_declared_machine_shows_nothing_beside_what_is_held_out(noise):
     found = [names_of(read_timing(without_the_middle(machine([62, seed], noise=noise))))
@@ -166,17 +172,20 @@ def test_uneven_marks_are_found_mark_by_mark():
     assert np.all(np.abs(np.array(value) - truth) < 4.0 * np.array(error))
 
 
+@pytest.mark.machines
 def test_two_effects_are_told_apart():
     timing = read_timing([machine(3, excess=1.0, rho=0.8, skew=4e-5)])
     assert names_of(timing) == {'correlated_jitter', 'clock_skew'}
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('noise', [0.02, 0.3, 2.0])
 def test_declared_machine_shows_nothing(noise):
     found = [names_of(read_timing([machine(100 + seed, noise=noise)])) for seed in range(8)]
     assert sum(bool(names) for names in found) <= 1
 
 
+@pytest.mark.machines
 def test_checks_are_calibrated_on_the_declared_machine():
     checks = [read_timing([machine(200 + seed)]).checks for seed in range(12)]
     p_values = np.array([each[i].p_value for each in checks for i in (0, 4)])
@@ -184,6 +193,7 @@ def test_checks_are_calibrated_on_the_declared_machine():
     assert p_values.min() > 1e-4
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('excess', [0.0, 2.0])
 def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
     steady = [read_timing([machine(300 + seed, count=1600, excess=excess)]).checks[-1].p_value
@@ -193,6 +203,7 @@ def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
     assert min(steady) > 0.05 / len(steady) / 5
 
 
+@pytest.mark.machines
 def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
     timing = read_timing([machine([0, k], count=163, excess=1.0, skew=9.5e-5) for k in range(2)])
     assert timing.choice.best == {'clock_skew', 'jitter_scale'}
@@ -200,6 +211,7 @@ def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
     assert abs(skew - 9.5e-5) < 4.0 * error
 
 
+@pytest.mark.machines
 def test_declared_bandwidth_that_is_too_small_is_another_number():
     rad = 2.0 * np.pi * MODEL.fundamental_frequency
     timing = read_timing([machine(0, wander=2.0, band=(0.0, 0.3))],
@@ -222,6 +234,7 @@ def surest(checks, text):
     return min((check.p_value for check in checks if text in check.text), default=1.0)
 
 
+@pytest.mark.machines
 def test_source_that_moves_as_a_sine_does_is_no_random_motion():
     text = 'a sinusoid of the source'
     random = [surest(read_timing([machine(40, wander=3.0, band=band)]).checks, text)
@@ -232,6 +245,7 @@ def test_source_that_moves_as_a_sine_does_is_no_random_motion():
     assert surest(timing.checks, text) < 1e-6
 
 
+@pytest.mark.machines
 def test_motion_of_a_few_swings_is_a_drift():
     for band, few in (((0.0, 0.005), True), ((0.0, 0.1), False)):
         timing = read_timing([machine(3, wander=4.0, band=band, count=450)])
@@ -245,6 +259,7 @@ def test_memory_is_no_longer_than_a_third_of_a_stretch():
     assert 0.6 < np.tanh(fit.starts['correlated_jitter'][1]) <= np.exp(-3.0 / 19.0) + 1e-9
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('effect', [{'shocks': 4.0}, {'hum': 1.5}])
 def test_effect_that_nobody_knows_is_seen(effect):
     for seed in range(2):
@@ -252,6 +267,7 @@ def test_effect_that_nobody_knows_is_seen(effect):
         assert min(check.p_value for check in timing.checks) < 1e-4
 
 
+@pytest.mark.machines
 def test_declared_effect_is_taken_as_declared_and_free_where_wrong():
     part = machine(5, excess=1.5)
     right = read_timing([part], [ExcessJitter(1.5 * UNIT)])
@@ -262,6 +278,7 @@ def test_declared_effect_is_taken_as_declared_and_free_where_wrong():
     assert abs(value - 1e-4) < 4.0 * error
 
 
+@pytest.mark.machines
 def test_larger_uniform_jitter_is_a_scale_and_normal_jitter_an_excess():
     scaled = read_timing([machine(7, scale=2.0, count=900)])
     assert names_of(scaled) == {'jitter_scale'}
@@ -285,6 +302,7 @@ def test_slope_of_the_likelihood_is_that_of_its_differences():
         assert slope[i] == pytest.approx(numeric, rel=1e-3, abs=1e-2)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', ['excess_jitter', 'clock_skew'])
 def test_limit_holds_as_often_as_it_says(name):
     # the true size is half the median limit of the declared machine
@@ -297,6 +315,7 @@ def test_limit_holds_as_often_as_it_says(name):
     assert 0.95 - np.mean(held) < 4.0 * np.sqrt(0.95 * 0.05 / len(held))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'sizes'), [
     ('excess_jitter', {'excess': 0.4}), ('phase_wander', {'wander': 0.5}),
     ('correlated_jitter', {'excess': 0.5, 'rho': 0.7})])
@@ -387,6 +406,7 @@ def test_search_for_a_limit_stays_finite_where_smaller_sizes_fit_worse(monkeypat
     assert np.all(np.isfinite(tried))
 
 
+@pytest.mark.machines
 def test_what_no_machine_can_have_is_in_no_set():
     """Pulses that come by minutes late were recovered wrongly: no delay makes that."""
     part = machine(3, swing=2e-3)
@@ -461,6 +481,7 @@ def test_distribution_of_single_errors_tells_normal_ones_beside_the_declared(rho
         for item in declared.data.stretches]).of_shape(nothing, 1.0) == 0.0
 
 
+@pytest.mark.machines
 def test_events_that_fade_are_no_normal_errors_with_a_memory():
     for seed in range(2):
         timing = read_timing([machine(seed, shocks=4.0)])
@@ -473,6 +494,7 @@ def test_events_that_fade_are_no_normal_errors_with_a_memory():
         assert fair > 1e-3
 
 
+@pytest.mark.machines
 def test_motion_that_ends_nowhere_is_no_remainder():
     """A shaft that shakes faster than half the trigger rate shows at an alias."""
     part = machine(8)
@@ -485,6 +507,7 @@ def test_motion_that_ends_nowhere_is_no_remainder():
     assert min(check.p_value for check in read_timing([moved]).checks) > 1e-3
 
 
+@pytest.mark.machines
 def test_sidebands_of_one_time_are_no_source_that_moves():
     part = machine(9)
     hum = 1.0 * UNIT * np.cos(2.0 * np.pi * 0.11 * part.setting.index)
@@ -518,6 +541,7 @@ def test_skew_beside_the_ticks_of_a_clock_is_found_with_its_error():
     assert np.max(np.abs(off)) < 3.0
 
 
+@pytest.mark.machines
 def test_jitter_does_not_make_a_skew_grow_with_the_angle():
     """Corrected pulse times have no jitter, and a skew puts none into them."""
     for seed in range(2):
@@ -525,6 +549,7 @@ def test_jitter_does_not_make_a_skew_grow_with_the_angle():
         assert timing.choice.best == {'clock_skew'}
 
 
+@pytest.mark.machines
 @given(st.integers(0, 99), st.sampled_from([-3e-3, -1e-4, 4e-5, 2e-3]), st.booleans())
 @settings(max_examples=5)
 def test_a_skew_that_was_found_and_is_declared_is_found_no_more(seed, skew, quiet):
@@ -533,6 +558,7 @@ def test_a_skew_that_was_found_and_is_declared_is_found_no_more(seed, skew, quie
     assert names_of(read_timing([part], [found])) == set()
 
 
+@pytest.mark.machines
 def test_skew_of_a_machine_whose_speed_changes_is_no_wander():
     """
     The delay that has grown turns the vibration as the speed changes.

@@ -82,6 +82,7 @@ def recording():
     return machine()
 
 
+@pytest.mark.machines
 def test_wrong_ratio_grows_with_the_angle_where_the_speed_changes(recording):
     content = told(recording, replace(MODEL, ratio=1.0002))
     assert names(content) == ['clock_skew']
@@ -114,6 +115,7 @@ def test_parameter_file_keeps_a_wrong_ratio_that_the_recording_states(recording,
     assert (again['verdict'], again['declared_changes']) == ('none', [])
 
 
+@pytest.mark.machines
 def test_wrong_ratio_at_one_speed_is_said_to_be_inseparable_from_a_skew():
     content = told(machine(swing=0.0), replace(MODEL, ratio=1.0002))
     assert (names(content), content['declared_changes']) == (['clock_skew'], [])
@@ -121,6 +123,7 @@ def test_wrong_ratio_at_one_speed_is_said_to_be_inseparable_from_a_skew():
     assert 'instead of 1.0002 makes the same at constant speed' in evidence
 
 
+@pytest.mark.machines
 def test_path_delay_does_not_depend_on_the_angle_that_all_lines_turn_by():
     delayed = machine(late=2e-3)
     content = told(delayed)
@@ -131,6 +134,7 @@ def test_path_delay_does_not_depend_on_the_angle_that_all_lines_turn_by():
     assert (right['verdict'], right['declared_changes']) == ('none', [])
 
 
+@pytest.mark.machines
 def test_noise_below_the_declared_is_another_number_and_no_effect(recording):
     content = told(recording, replace(MODEL, noise_std=2.0 * NOISE))
     assert (content['verdict'], names(content)) == ('none', [])
@@ -147,6 +151,7 @@ def test_noise_below_the_declared_is_another_number_and_no_effect(recording):
     assert told(recording, model)['declared_changes'] == []
 
 
+@pytest.mark.machines
 def test_noise_above_the_declared_is_another_number_where_it_matters_little(recording):
     content = told(recording, replace(MODEL, noise_std=0.9 * NOISE))
     assert content['verdict'] == 'none'
@@ -156,6 +161,7 @@ def test_noise_above_the_declared_is_another_number_where_it_matters_little(reco
     assert abs(change['value'] - NOISE) < 4.0 * change['standard_error']
 
 
+@pytest.mark.machines
 def test_declared_noise_that_is_not_there_is_another_number(recording):
     content = told(recording, declared=[make_effect('additive_noise', std=NOISE)])
     change, = content['declared_changes']
@@ -163,6 +169,7 @@ def test_declared_noise_that_is_not_there_is_another_number(recording):
     assert change['value'] < 0.5 * NOISE
 
 
+@pytest.mark.machines
 def test_period_of_a_declared_clock_need_not_be_declared():
     rounded = machine(clock=3e3)
     model = replace(MODEL, keyphasor_rate=3e3)
@@ -176,12 +183,14 @@ def test_period_of_a_declared_clock_need_not_be_declared():
     assert 'clock_rate' in {item['parameter'] for item in other['declared_changes']}
 
 
+@pytest.mark.machines
 def test_beat_slower_than_an_average_is_that_of_an_interpolator():
     content = told(machine(source_rate=RATE - 0.23))  # six beats, an average takes 1 s
     assert names(content) == ['interpolation_loss']
     assert content['missing_effects'][0]['parameters']['method']['value'] == 'linear'
 
 
+@pytest.mark.machines
 def test_noise_that_is_declared_in_another_unit_ends_in_no_error():
     content = told(machine(scale=1e-9))
     assert content['verdict'] == 'none'
@@ -189,6 +198,7 @@ def test_noise_that_is_declared_in_another_unit_ends_in_no_error():
     assert change['value'] == pytest.approx(1e-9 * NOISE, rel=0.05)
 
 
+@pytest.mark.machines
 def test_tone_that_hides_its_order_is_named():
     """An order that a tone makes too unsteady to be compared is what the tone disturbs."""
     frequency = 40.0 * SPEED + 0.3
@@ -200,12 +210,14 @@ def test_tone_that_hides_its_order_is_named():
         assert abs(value - true) < 3.0 * error
 
 
+@pytest.mark.machines
 def test_tone_is_no_modulation():
     content = told(machine(swing=0.01, tone=(20.0 * SPEED + 0.5, 0.15)),
                    replace(MODEL, orders=(20.0,)))
     assert names(content) == ['interfering_tone']
 
 
+@pytest.mark.machines
 def test_declared_wander_bends_the_angle_inside_cycles():
     """What bends is the declared wander, and no speed that fluctuates."""
     bandwidth = 0.44
@@ -214,6 +226,7 @@ def test_declared_wander_bends_the_angle_inside_cycles():
     assert (content['verdict'], content['declared_changes']) == ('none', [])
 
 
+@pytest.mark.machines
 def test_run_up_passes_the_declared_speed():
     """The speed is half as high again at the end."""
     content = told(machine(rise=0.5, swing=0.0), replace(MODEL, trigger_speed=1.2 * SPEED))

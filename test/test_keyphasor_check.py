@@ -10,17 +10,23 @@
 
 """Targets, strays, clocks and jitter of which nothing is declared are found as they are."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import RecordingError, SignalError
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.clock import find_clock
+from sa_jitter_ros.keyphasor_check.costs import _of_speed
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
-from sa_jitter_ros.keyphasor_check.lines import marks_evidence, ToothLines
+from sa_jitter_ros.keyphasor_check.lines import (
+    _per_line, marks_evidence, on_orders, ToothLines)
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
+from sa_jitter_ros.keyphasor_check.vibration import recovered_jitter
 from sa_jitter_ros.keyphasor_check.wheel import patterns
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -242,6 +248,7 @@ def test_cost_of_a_coarse_clock_is_what_an_average_loses(rng):
 
 # --- what does not fit --------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('code', 'change', 'rate'), [
     ('unit_ms', lambda times: 1e3 * times, RATE),
     ('unit_samples', lambda times: np.rint(RATE * times), RATE),
@@ -302,6 +309,7 @@ def test_strays_alone_are_no_wheel(rng, count):
         checked(vibration(rng), np.sort(rng.uniform(0.0, SECONDS, count)))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'missing'), [(1, ()), (8, ()), (36, (35,))])
 def test_a_wheel_with_a_fifth_lost_and_as_many_strays_is_one(rng, marks, missing):
     pulses, *_ = tach(rng, marks, missing=missing, lost=0.2)
@@ -333,6 +341,7 @@ def test_delay_of_the_tach_turns_all_orders_alike(rng, delay):
     assert found.standard_error < 2e-5
 
 
+@pytest.mark.machines
 def test_delay_has_the_error_that_is_stated(rng):
     """Over 8 drawn machines whose speed hardly changes: all pulses of one turn all orders."""
     found = [checked(vibration(rng, drift=0.05), tach(rng, drift=0.05, jitter=2e-5)[0]).findings[
@@ -371,6 +380,7 @@ def test_delay_is_not_given_where_orders_disagree(rng):
 
 # --- measured -----------------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'marks', 'missing', 'clock', 'speed'), [
     ('gear0_gearbox', 1, 0, None, 33.33),
     ('motor_30V_100kHz', 8, 0, 100e3, 94.4),
@@ -397,6 +407,7 @@ def test_measured_engines(shared_data, name, missing):
     assert 'uneven_marks' in codes(check)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('ripple', 'late'), [(3.4, 0.0), (0.5, 0.0), (0.0, 2.0), (0.0, 0.5)])
 def test_the_vibration_tells_uneven_marks_from_a_speed_that_ripples(ripple, late):
     """The pulses of both are alike; degrees. A crank gets trigger cycles from mark to mark."""
@@ -444,3 +455,54 @@ def test_a_vibration_may_repeat_several_times_in_a_revolution():
     one, two, four = marks_evidence(lines, [1, 2, 4]).values()
     assert 1.0 < one - two < 2.5  # not the four lines that would be at odd orders by chance
     assert 1.5 < one - four < 3.5
+
+
+def test_a_line_that_falls_anywhere_says_nothing_for_a_shaft(rng):
+    """The likelihood ratio of a random line has the mean 1, however dense the orders are."""
+    for ratio in (0.06, 0.3, 2.0):
+        places = np.sort(rng.uniform(50.0, 100.0, 200_000))
+        lines = ToothLines(places, *np.ones((2, places.size)), 0.05)
+        on = on_orders(lines, ratio)[1].mean()
+        said = np.exp(_per_line(lines, ratio))
+        assert on * said + (1.0 - on) * 0.3 == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_tach_shaft_with_orders_of_its_own_is_the_one_of_interest(rng):
+    """Nobody named another shaft, whose lines are stronger and more."""
+    own = vibration(rng, orders=((1.0, 0.5), (2.0, 0.5), (3.0, 0.5), (4.0, 0.5), (5.0, 0.3)))
+    other = vibration(rng, ratio=2.40789)
+    assert checked(own + 3.0 * other, tach(rng)[0]).findings['ratio'].value == 1.0
+
+
+@pytest.mark.parametrize(('scatter', 'shown'), [(0.3, False), (0.8, True)])
+def test_pulse_errors_below_their_own_uncertainty_show_no_jitter(rng, scatter, shown):
+    average, *_ = sa.average(vibration(rng), RATE, tach(rng)[0], orders=[19.0], trigger_cycles=40,
+                             correct_jitter=True, keyphasor_rate=3000.0)
+    known = np.full(41, 1e-5)
+
+    def drawn():
+        errors = rng.normal(0.0, np.hypot(1.0, scatter) * 1e-5, 41)
+        errors -= errors.mean()
+        return replace(average, correction=replace(
+            average.correction, accepted=True, pulse_errors=errors, standard_errors=known))
+    found = recovered_jitter([drawn() for _ in range(200)])
+    assert (found is not None) == shown
+    if shown:
+        assert found.std == pytest.approx(scatter * 1e-5, rel=0.1)
+
+
+def test_cost_of_a_run_up_is_what_the_straight_angle_law_loses():
+    """At a speed that grows by 2 % in each revolution, within which it is ahead by its half."""
+    fitted = SimpleNamespace(speed=25.0 * 1.02 ** np.arange(50.0),
+                             pattern=SimpleNamespace(present=1))
+    found, = _of_speed(fitted, 1.0, [20.0, 40.0], None)
+    u = (np.arange(1000) + 0.5) / 1000
+    lost = [100.0 - 100.0 * abs(np.mean(np.exp(2j * np.pi * g * 0.01 * u * (1.0 - u))))
+            for g in (20.0, 40.0)]
+    np.testing.assert_allclose([cost for _, cost in found.cost], lost, rtol=0.25)
+
+
+def test_what_marks_do_not_show_of_the_speed_is_given_in_per_cent():
+    found, = _of_speed(None, 1.0, [1.0, 2.0], (np.array([0.1, 0.2]), np.array([0.01, 0.013])))
+    assert 'no order here then loses more than 1.3 %' in found.text
+    assert dict(found.cost) == {1.0: 10.0, 2.0: 20.0}

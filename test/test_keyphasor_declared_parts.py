@@ -43,6 +43,8 @@ def test_the_right_teeth_are_not_contradicted():
 
 @pytest.mark.parametrize(('wrong', 'name'), [
     ({'first': 20}, 'first.teeth is 20, but 5 lines of the vibration fit 19'),
+    ({'first': 17}, 'first.teeth is 17, but 5 lines of the vibration fit 19'),
+    ({'first': 22}, 'first.teeth is 22, but 5 lines of the vibration fit 19'),
     ({'second': 60}, 'first.mate_teeth is 60, but 5 lines of the vibration fit 61'),
     ({'third': 33}, 'second.teeth is 33, but 5 lines of the vibration fit 32'),
     ({'fourth': 25}, 'second.mate_teeth is 25, but 5 lines of the vibration fit 24')])
@@ -67,6 +69,7 @@ def test_a_planetary_stage():
     assert [item.code for item in contradictions(lines, other)] == ['mesh_absent']
 
 
+@pytest.mark.machines
 def test_random_lines_contradict_nothing_by_chance():
     """Of 200 machines whose lines are somewhere, beside two harmonics of the mesh."""
     rng = np.random.default_rng(1)
@@ -76,6 +79,7 @@ def test_random_lines_contradict_nothing_by_chance():
     assert len(codes) <= 2
 
 
+@pytest.mark.machines
 def test_a_check_takes_the_machine():
     time = np.arange(200_000) / 5e3
     angle = 2.0 * np.pi * RATIO * 10.0 * time

@@ -60,6 +60,7 @@ def run_all(path, folder, capsys):
     return ''.join(capsys.readouterr()), json.loads((folder / 'loop/report.json').read_text())
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('turns', 'marks'), [(9, 6), (9, 1)])
 def test_a_short_recording_is_averaged_and_says_what_is_too_short(tmp_path, capsys, turns, marks):
     write_rig(tmp_path / 'rig.npz', turns=turns, marks=marks)
@@ -70,12 +71,14 @@ def test_a_short_recording_is_averaged_and_says_what_is_too_short(tmp_path, caps
     assert reason.endswith('take at least 4; record longer')
 
 
+@pytest.mark.machines
 def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(tmp_path, capsys):
     write_rig(tmp_path / 'rig.npz', turns=48, marks=60, missing=2, torsion=np.radians(3.4))
     text, _ = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
     assert 'averages of 1 recording' in text
 
 
+@pytest.mark.machines
 def test_a_file_without_orders_names_none_and_is_taken(tmp_path, capsys):
     """It says what to add; averager and predictor take orders of their own meanwhile."""
     write_rig(tmp_path / 'rig.npz', turns=200, orders=())
@@ -110,7 +113,7 @@ RECORDINGS = [
     *EDGES, ('crank_vr_60_2', {}), ('crank_vr_60_2', {'tach': 'tach_4'}), ('gear0_gearbox', {}),
     *((f'motor_{name}', {}) for name in ('10V_100kHz', '30V_100kHz', 'runup_20V_40kHz')),
     *((f'rotorbalancer_{name}', {'acquisition': k})
-      for name in ('weight', 'weight_5', 'without_weight') for k in (0, 6)),
+      for name, k in (('weight', 0), ('weight_5', 6), ('without_weight', 3))),
     ('turbine_20130316', {}), ('uia_bearing_rig_1', {}),
     ('encoder_motor_slow', {})]
 
@@ -123,6 +126,7 @@ def cut(recording, seconds):
                    ArraySource(tach[None, :int(seconds * recording.tach_rate)]))
 
 
+@pytest.mark.machines
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 @pytest.mark.parametrize(('name', 'fields'), RECORDINGS)
 def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, name, fields):

@@ -204,6 +204,7 @@ def test_player_plays_the_good_channels_and_warns(recording, tmp_path, ros_graph
     assert 'ratio 1.37' in node._last_warning
 
 
+@pytest.mark.machines
 def test_loop_uses_the_good_channels_and_warns(recording):
     with pytest.warns(DataWarning) as caught:
         found = loop(with_bad_channels(recording), DECLARED)
@@ -216,6 +217,7 @@ def test_loop_uses_the_good_channels_and_warns(recording):
         'loose is NaN', 'dead is cons', 'clipped is s']
 
 
+@pytest.mark.machines
 def test_loop_leaves_out_a_channel_with_gaps(recording):
     samples = recording.read()
     holes = np.vstack((samples, samples[:1]))
@@ -231,6 +233,7 @@ def test_loop_leaves_out_a_channel_with_gaps(recording):
     assert 'gappy' in found.report['remarks'][0]
 
 
+@pytest.mark.machines
 def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
     write_npz(tmp_path / 'rig.npz', with_bad_channels(recording))
     (tmp_path / 'model.yaml').write_text('jitter_predictor:\n  ros__parameters:\n' + ''.join(
@@ -242,11 +245,13 @@ def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
     assert len(said) == 3
 
 
+@pytest.mark.machines
 def test_loop_names_orders_that_are_not_there(recording):
     with pytest.warns(DataWarning, match='none of the orders 5, 11 stands above'):
         loop(recording, {**DECLARED, 'orders': [5, 11]})
 
 
+@pytest.mark.machines
 def test_loop_names_orders_that_are_not_there_without_pulse_times(recording):
     pulses = recording.pulse_times
     with pytest.warns(DataWarning, match='none of the orders 5, 11 stands above'):

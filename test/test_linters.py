@@ -112,6 +112,7 @@ def test_ament_copyright():
     check('ament_copyright.main', *SOURCES, 'CONTRIBUTING.md', 'LICENSE')
 
 
+@pytest.mark.style
 @pytest.mark.skipif(
     tuple(map(int, np.__version__.split('.')[:2])) < (2, 3),
     reason='types are checked against those of numpy 2.3 or later')

@@ -51,6 +51,7 @@ def found(recording):
     return close_loop([recording], KEYWORDS)
 
 
+@pytest.mark.machines
 def test_every_way_to_name_recording_and_model_finds_the_same(recording, found, tmp_path):
     path, declared = tmp_path / 'rig.npz', tmp_path / 'model.yaml'
     np.savez(path, vibration=recording.read(), sample_rate=RATE, pulse_times=recording.pulse_times)
@@ -80,6 +81,7 @@ def test_written_report_is_the_report(found, tmp_path):
         tmp_path / 'a' / 'b').iterdir()}
 
 
+@pytest.mark.machines
 def test_channel_of_nearly_nothing_is_left_out(recording, found):
     samples = np.concatenate([recording.read(), 1e-200 * recording.read()])
     with pytest.warns(DataWarning, match='channel 1 is constant and is left out'):
@@ -93,6 +95,7 @@ def test_channel_of_nearly_nothing_is_left_out(recording, found):
     assert alone.report['error_before']['rms'] is None
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('second', [False, True])
 def test_gap_in_the_vibration_costs_the_trigger_cycles_that_it_touches(recording, found, second):
     samples = recording.read().copy()
@@ -116,6 +119,7 @@ def test_gap_in_the_vibration_costs_the_trigger_cycles_that_it_touches(recording
     assert len(observation.acquisitions) >= 15
 
 
+@pytest.mark.machines
 def test_reference_that_is_the_pulse_times_is_none(recording, found):
     twice = replace(recording, reference_pulse_times=recording.pulse_times)
     content = close_loop(twice, KEYWORDS).report
@@ -123,6 +127,7 @@ def test_reference_that_is_the_pulse_times_is_none(recording, found):
     assert any('the pulse times themselves' in text for text in content['remarks'])
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('alone', [True, False])
 def test_channel_with_a_loose_contact_spoils_no_average(recording, found, alone):
     """It costs the trigger cycles, or is left out beside another, and the report says so."""
@@ -140,6 +145,7 @@ def test_channel_with_a_loose_contact_spoils_no_average(recording, found, alone)
     assert any('stuck at one value' in text for text in content['remarks'])
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', ['pulse_times', 'reference_pulse_times'])
 def test_pulses_without_any_jitter_have_a_report(name, tmp_path):
     """Their errors are all 0, and their intervals equal to rounding."""

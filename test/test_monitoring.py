@@ -12,7 +12,9 @@
 
 from dataclasses import replace
 import errno
+import math
 import os
+from types import SimpleNamespace
 import zipfile
 
 from drawn_machine import DrawnMachine as Machine, LEVELS, SECONDS, SETTINGS
@@ -23,11 +25,12 @@ from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
-from sa_jitter_ros.monitoring.change_test import ChangeTest
+from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
 from sa_jitter_ros.monitoring.evidence import ChangeEvidence, threshold
-from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor
-from sa_jitter_ros.monitoring.monitor import Settings, YEAR
-from sa_jitter_ros.monitoring.quantities import KINDS, monitored
+from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor, Pairing
+from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor, YEAR
+from sa_jitter_ros.monitoring.quantities import KINDS, Layout, monitored
+from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
 
 # --- false alarms --------------------------------------------------------------------------------
@@ -47,6 +50,7 @@ def alarms_of(draw, *, units, quantities, learning, scores, length):
     return found, units * (length - learning) / scores
 
 
+@pytest.mark.machines
 def test_evidence_reaches_its_threshold_once_in_the_stated_number_of_scores():
     rng = np.random.default_rng(1)
     units, quantities, scores = 400, 4, 400.0
@@ -117,6 +121,50 @@ def test_slow_unsteadiness_below_the_noise_is_learnt():
     assert late <= 2.0 * expected + 3.0 * np.sqrt(2.0 * expected)
 
 
+def test_values_that_alternate_have_no_memory_and_those_of_a_walk_the_largest(rng):
+    assert memory_of(np.tile([[1.0], [-1.0]], (50, 1))) == 0.0
+    assert memory_of(rng.standard_normal((200, 30)).cumsum(axis=0)) == 0.95
+
+
+def scored(values):
+    """Return the score of the last value (count, unit) of each unit, that learns those before."""
+    place, none = SpeedBin((values.shape[1], 1)), np.zeros((values.shape[1], 1))
+    for value in values[:, :, None]:
+        scores, weights = place.score(value, none, none, none + 1.0)
+        place.learn(value, none, none, weights, none > 0.0)
+    return scores[0]
+
+
+@pytest.mark.parametrize('level', [1.0, 2.5])
+def test_scores_of_a_short_baseline_are_normal(rng, level):
+    found = np.mean(abs(scored(rng.standard_normal((9, 40_000)))) > level)
+    wanted = math.erfc(level / np.sqrt(2.0))
+    assert found == pytest.approx(wanted, abs=4.0 * np.sqrt(wanted / 40_000))
+
+
+def test_skewness_that_the_baseline_shows_is_no_change(rng):
+    """Of a gamma distribution, 1 % of which lie 3 standard deviations above the mean."""
+    assert np.mean(scored(rng.gamma(4.0, size=(300, 3000))) > 3.0) < 0.006
+
+
+def test_what_is_unsure_of_the_amplitudes_is_so_of_moments_by_their_power():
+    average = Machine(21, bias=0.02).average()
+    assert average.layout.indicators == ('rms', 'kurtosis', 'm8a')
+    unsure = average.doubt[:, len(average.layout.orders):][:, :3]
+    np.testing.assert_allclose(unsure, 0.02 * np.array([[1.0, 4.0, 8.0]] * 2), rtol=0.05)
+
+
+@pytest.mark.parametrize('amplitude', [0.0, 0.3, 5.0])
+def test_squares_of_amplitudes_scatter_as_those_of_drawn_ones(rng, amplitude):
+    noise, doubt = 0.2, 0.01
+    drawn = abs(amplitude + noise * (rng.standard_normal((100_000, 2)) @ (1.0, 1.0j))) ** 2
+    monitor = SimpleNamespace(layout=SimpleNamespace(orders=(19.0,)))
+    (variance,), (known,) = (item[0] for item in ShaftMonitor._of_squares(monitor, *(
+        np.array([[value]]) for value in (amplitude**2, noise**2, doubt))))
+    assert variance == pytest.approx(drawn.var(), rel=0.03)
+    assert known == pytest.approx(2.0 * np.hypot(amplitude, noise) * doubt)
+
+
 def test_threshold_follows_from_the_rate_of_averages_and_of_false_alarms():
     machine = Machine(1)
     monitor = machine.monitor(false_alarms_per_year=2.0)
@@ -160,6 +208,7 @@ def test_indicators_change_too_and_fall():
     assert found.change == pytest.approx(-0.06, abs=4.0 * found.standard_error)
 
 
+@pytest.mark.machines
 def test_standard_errors_of_changes_hold():
     """Without selection: the estimate of what came since a change that is far above threshold."""
     z = []
@@ -420,6 +469,16 @@ def test_shaft_without_bearing_orders_waits_for_none_once_it_is_known():
     assert later.averages == 1
 
 
+@pytest.mark.parametrize(('indicators', 'bearings', 'awaited'), [
+    ((), (), KINDS[:1]), (('rms',), (), KINDS[:3]), ((), (4.9,), (KINDS[0], KINDS[3])),
+    (('rms',), (4.9,), KINDS)])
+def test_an_average_is_complete_with_the_arrays_that_its_layout_has(indicators, bearings, awaited):
+    pairing = Pairing(Layout(2, (19.0, 38.0), indicators, bearings))
+    arrays = dict(zip(KINDS, Machine(20).messages()))
+    found = [len(pairing.add(kind, arrays[kind])) for kind in awaited]
+    assert found == [0] * (len(awaited) - 1) + [1]
+
+
 def test_bearing_orders_that_the_baseline_lacks_are_refused():
     machine = Machine(19)
     orders, indicators, errors, envelope = machine.messages()
@@ -470,7 +529,7 @@ def kept(tmp_path):
 
 def test_baseline_survives_a_restart(kept):
     machine, monitor, path = kept
-    again = read_baseline(path, 'pump 3', SETTINGS)['input']
+    again = read_baseline(path, 'pump 3', SETTINGS, 1.0)['input']
     assert again.changes() == monitor.changes() != []
     assert (again.averages, again.is_complete) == (monitor.averages, True)
     for _ in range(300):
@@ -502,7 +561,7 @@ def test_damaged_file_is_refused_in_one_line_and_kept(kept, kind):
     damage(path, kind)
     before = path.read_bytes()
     with pytest.raises(RecordingError) as refused:
-        read_baseline(path, 'pump 3', SETTINGS)
+        read_baseline(path, 'pump 3', SETTINGS, 1.0)
     assert str(refused.value).startswith(f'{path}: is no intact baseline')
     assert 'move it away to learn again' in str(refused.value)
     assert '\n' not in str(refused.value)
@@ -512,13 +571,13 @@ def test_damaged_file_is_refused_in_one_line_and_kept(kept, kind):
 def test_every_cut_and_flipped_byte_is_noticed(kept):
     path, rng = kept[2], np.random.default_rng(5)
     whole = path.read_bytes()
-    intact, lines = read_baseline(path, 'pump 3', SETTINGS)['input'].changes(), []
+    intact, lines = read_baseline(path, 'pump 3', SETTINGS, 1.0)['input'].changes(), []
     for place in rng.integers(0, len(whole), 60).tolist():
         flipped = bytearray(whole)
         flipped[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(flipped)
         try:  # a byte of a date or a comment in the archive says nothing of the arrays
-            assert read_baseline(path, 'pump 3', SETTINGS)['input'].changes() == intact
+            assert read_baseline(path, 'pump 3', SETTINGS, 1.0)['input'].changes() == intact
         except RecordingError as error:
             lines.append(str(error))
     assert lines
@@ -530,25 +589,26 @@ def test_file_that_is_no_file_or_another_archive_is_refused(tmp_path):
     os.mkfifo(path)
     for place in (path, tmp_path):
         with pytest.raises(RecordingError):
-            read_baseline(place, '', SETTINGS)
+            read_baseline(place, '', SETTINGS, 1.0)
     other = tmp_path / 'other.npz'
     np.savez(other, vibration=np.zeros(3))
     with pytest.raises(RecordingError, match='is no intact baseline'):
-        read_baseline(other, '', SETTINGS)
-    assert read_baseline(tmp_path / 'none.npz', '', SETTINGS) == {}
+        read_baseline(other, '', SETTINGS, 1.0)
+    assert read_baseline(tmp_path / 'none.npz', '', SETTINGS, 1.0) == {}
 
 
 def test_baseline_of_another_machine_is_refused(kept):
     machine, monitor, path = kept
     with pytest.raises(RecordingError, match="machine 'pump 3', this one is 'pump 4'"):
-        read_baseline(path, 'pump 4', SETTINGS)
+        read_baseline(path, 'pump 4', SETTINGS, 1.0)
     with pytest.raises(RecordingError, match='was learnt with group_averages 5, now it is 4'):
-        read_baseline(path, 'pump 3', replace(SETTINGS, group_averages=4))
+        read_baseline(path, 'pump 3', replace(SETTINGS, group_averages=4), 1.0)
     orders, indicators, errors, _ = machine.messages()
     orders.values[..., 0] += 1.0
     with pytest.raises(ParameterError, match=r'orders 2, 20, 39 .* another machine'):
         monitor.update(monitored(dict(zip(KINDS, (orders, indicators, errors)))))
-    assert len(read_baseline(path, 'pump 3', replace(SETTINGS, false_alarms_per_year=5.0))) == 1
+    other = replace(SETTINGS, false_alarms_per_year=5.0)
+    assert len(read_baseline(path, 'pump 3', other, 1.0)) == 1
 
 
 def test_full_disk_and_unwritable_folder_keep_the_older_file(kept, monkeypatch):

@@ -106,6 +106,8 @@ def test_bins_are_told_apart():
             for speed in (16.6, 17.5, 18.4, 15.8, 1e-3, 1e6) for state in (0.0, 11.0, -9.0, 1e6)}
     assert len({*keys.values()}) == len(keys)
     assert all(float(key) == key for key in keys.values())
+    farthest = {bins.key(speed, 1e12) for speed in (16.6, 17.5)}
+    assert all(0 < key < 1 << 53 for key in farthest)  # which floats tell apart
     assert bins.words(keys[15.8, -9.0]) == '15.81 Hz and state -10'
     assert bins.key(16.6, math.nan) is bins.key(0.0, 1.0) is bins.key(math.nan, 1.0) is None
     assert OperatingBins(0.05, 0.0).key(16.6, math.nan) == 0

@@ -111,6 +111,7 @@ def test_every_average_is_true_in_spite_of_faults(ros_graph, averaging, seed, sc
     assert status['cycles_dropped'] > 0
 
 
+@pytest.mark.machines
 def test_no_average_mixes_old_and_new_parameters(ros_graph, rng):
     b = SceneBench(ros_graph, 5)
     for name, value in (('trigger_cycles', 9), ('gear.ratio', 0.41), ('pulses_per_trigger', 1),

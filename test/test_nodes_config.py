@@ -113,6 +113,7 @@ def test_sections_describe_the_same_machine():
         'output_shaft'}
 
 
+@pytest.mark.machines
 def test_nodes_of_the_machine_file_find_the_truth_of_its_simulator(ros_graph):
     names = ('synchronous_averager', 'jitter_predictor', 'residual_analyser', 'live_view',
              'change_monitor')
@@ -153,6 +154,7 @@ def test_nodes_of_the_machine_file_find_the_truth_of_its_simulator(ros_graph):
         'condition_indicator', indicators[-1]).values).all()
 
 
+@pytest.mark.machines
 def test_commands_read_the_machine_file(capsys, tmp_path):
     declaration = read_declaration(MACHINE)
     assert declaration.unknown == ()

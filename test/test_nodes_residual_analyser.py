@@ -162,6 +162,7 @@ def test_trace_finds_the_grid_of_a_clock():
     assert found.after.rms < 0.1 * found.before.rms
 
 
+@pytest.mark.machines
 def test_trace_names_indistinguishable_effects():
     found = trace_averages(synthetic(20, wander=3e-5), MODEL)
     assert [item.name for item in found.findings] == ['phase_wander']
@@ -456,6 +457,7 @@ def test_node_that_is_no_predictor_is_reported(bench):
     assert b.reports()[0]['declared']['keyphasor_rate'] == CLOCK
 
 
+@pytest.mark.machines
 def test_effects_are_set_in_the_predictor_and_a_refusal_is_reported(bench, ros_graph):
     predictor = ros_graph.add(JitterPredictor, {
         'keyphasor_rate': CLOCK, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,

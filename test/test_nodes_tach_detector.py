@@ -279,6 +279,7 @@ def joint_state(time, **positions):
     return message
 
 
+@pytest.mark.machines
 def test_joint_gives_corrected_orders(ros_graph, rng):
     """From positions at 1 kHz, of 14 bits and with noisy stamps, to the true amplitudes."""
     speed, rate, seconds, stamp = 20.0, 4000.0, 2.6, 1e-4

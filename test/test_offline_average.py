@@ -288,6 +288,7 @@ def test_a_tach_that_is_recorded_twice_is_drawn(tmp_path):
     assert imread(tmp_path / 'repairs.png').shape[1] > 600
 
 
+@pytest.mark.machines
 def test_what_was_repaired_is_drawn(tmp_path):
     """A stray pulse, a lost one and a spike of the tach: `average` and `check_keyphasor` show."""
     rate, rng = 5000.0, np.random.default_rng(1)

@@ -244,6 +244,7 @@ def test_a_load_that_changes_is_a_change_where_it_is_not_known(loads):
     assert any(text.startswith('order 19 of shaft, channel 0: +') for text in texts)
 
 
+@pytest.mark.machines
 def test_days_are_compared_with_days_of_their_load(loads, tmp_path):
     assert run(*loads, '--state', 'torque', '-p', 'state_bin:=100') == 0
     found = answer(loads[2])

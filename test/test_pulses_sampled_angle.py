@@ -219,8 +219,9 @@ def hurt(rng, angle, turn):
     return (angle if turn == TURN else np.rint(angle)), where
 
 
-@pytest.mark.parametrize('kind', ['pi', 'turn', 'none', 'reset each turn', 'overflow of 8 bits',
-                                  'overflow of 16 bits'])
+@pytest.mark.parametrize('kind', ['pi', 'overflow of 16 bits', *(
+    pytest.param(kind, marks=pytest.mark.machines)
+    for kind in ('turn', 'none', 'reset each turn', 'overflow of 8 bits'))])
 @given(st.integers(0, 2**31))
 @settings(max_examples=20, deadline=None)
 def test_glitches_anywhere_leave_the_pulses_and_any_cut_is_the_same(kind, seed):

@@ -13,7 +13,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.pulses.interval_model import IntervalModel
-from sa_jitter_ros.pulses.mark_pattern import repeating, steady_pattern
+from sa_jitter_ros.pulses.mark_pattern import regular_start, repeating, steady_pattern
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings import read
@@ -179,7 +179,7 @@ def test_a_displaced_pulse_is_known_from_the_jitter_of_the_first_revolutions():
 def test_a_displaced_pulse_beside_a_gap_is_no_pattern_of_two_marks(again):
     """Nor does it tell the scatter, at the start and behind a loss of the match."""
     used = lost = 0
-    for trial in range(200):
+    for trial in range(100):
         rng = np.random.default_rng([trial, 43])
         pulses = 1.0 + 0.02 * (np.arange(80.0) + rng.uniform(-0.0039, 0.0039, 80))
         first = 40 if again else 0  # a loss of the match there
@@ -197,7 +197,7 @@ def test_a_displaced_pulse_beside_a_gap_is_no_pattern_of_two_marks(again):
         used += pulses[displaced] in found
         lost += given.size - 1 - np.isin(given, found).sum()
     assert used <= 1
-    assert lost < 200
+    assert lost < 100
 
 
 def test_two_displaced_pulses_do_not_hide_each_other(rng):
@@ -489,3 +489,18 @@ def test_every_other_pulse_that_stays_away_is_named():
     assert np.count_nonzero(~found.starts_run) >= 50
     message, = validator.take_messages()
     assert 'every other pulse is missing' in message
+
+
+@pytest.mark.parametrize(('pulses', 'narrowest'), [
+    (1, 0.001), (10, 0.01), (60, 0.03), (1000, 0.03)])
+def test_a_steady_shaft_narrows_the_tolerance_to_what_no_average_shows(pulses, narrowest):
+    model = IntervalModel(given=0.0, pulses_per_trigger=pulses, block=8)
+    model.start(0.0, scatter=0.0, count=200)
+    assert model.tolerance == pytest.approx(narrowest)
+
+
+@pytest.mark.parametrize(('levels', 'first'), [
+    ([], 0), ([0.3, 0.0], 0), ([0.3, 0.0, 0.0, 0.0], 1), ([0.5, 0.1, 0.2, 0.3], 1),
+    ([0.0, 1.0, 9.0], 0)])
+def test_intervals_are_regular_from_the_first_that_others_confirm(levels, first):
+    assert regular_start(np.array(levels), 0.01) == first

@@ -214,8 +214,7 @@ class Scatter:
         """Return the scatter of `cycles` (cycle, channel, order), `clean` without leakage."""
         mean = clean.mean(axis=0)
         size = np.abs(mean)
-        known = size > _TINY
-        turned = clean * np.conj(np.where(known, mean, 1.0) / np.where(known, size, 1.0))
+        turned = clean * np.exp(-1j * np.angle(mean))
         radial, tangential = turned.real - size, turned.imag
         noises, freedoms, tones = _white(np.stack((radial, tangential), axis=1))
         both = noises.mean(axis=0)

@@ -555,7 +555,7 @@ def _squares(signal: Array, peak: Array) -> Array:
 def _mesh_envelope(spectrum: Array, points: int, settings: GearSettings) -> Array:
     """Return the envelope (..., angle) of the lowest mesh order and those around it."""
     mesh = min(int(order) for order in settings.mesh_orders)
-    reach = min(mesh // 2, mesh - 1, (points - 1) // 2 - mesh)
+    reach = min(mesh // 2, (points - 1) // 2 - mesh)
     count = next_fast_len(_ENVELOPE_POINTS * (2 * reach + 1))
     band = np.zeros((*spectrum.shape[:-1], count), complex)
     band[..., :2 * reach + 1] = spectrum[..., mesh - reach:mesh + reach + 1]

@@ -129,11 +129,7 @@ def radial_noise(cycles: ComplexArray) -> FloatArray:
     count = len(cycles)
     if count < 2:
         return np.full(cycles.shape[1:], np.nan)
-    mean = cycles.mean(axis=0)
-    size = np.abs(mean)
-    known = size > np.finfo(np.float64).tiny
-    turn = np.where(known, mean, 1.0) / np.where(known, size, 1.0)
-    radial = (cycles * np.conj(turn)).real
+    radial = (cycles * np.exp(-1j * np.angle(cycles.mean(axis=0)))).real
     lines = (count - 1) // 2
     if lines < _MEDIAN_FROM:
         return np.asarray(np.sqrt(radial.var(axis=0, ddof=1) / count))

@@ -56,8 +56,7 @@ def without_lines(averages: Sequence[Average], *, fewest: int = 1) -> str:
     mean = np.abs(np.where(known, amplitudes, 0.0).sum(axis=0))
     scatter = np.where(known, noise, 0.0).sum(axis=0) / np.sqrt(
         np.maximum(np.count_nonzero(known, axis=0), 1))
-    if np.mean(clear.any(axis=(1, 2))) > 0.5 or np.any(
-            known.any(axis=0) & (mean > _STANDS * scatter)):
+    if np.mean(clear.any(axis=(1, 2))) > 0.5 or np.any(mean > _STANDS * scatter):
         return ''
     speed = float(np.mean([item.trigger_speed for item in averages]))
     return (f'none of the orders {listed(averages[0].orders)} stands above its noise at '

@@ -130,7 +130,7 @@ class StreamingAverager:
         self._run = 0  # where the run of the next cycle begins
         self._pulse_epoch = 0
         self._last_count = 0  # of the trigger cycles at the last pulse
-        self._last_time = 0.0  # s, of the last pulse as it came
+        self._last_time = np.nan  # s, of the last pulse as it came
         self._lead = np.inf  # s of samples before a cycle that its interpolation reads
         self._speed = 0, 0.0  # cycles and seconds since the last take_speed
         self._messages: list[str] = []

@@ -106,7 +106,7 @@ class _Check:
         self._warnings: list[Warn] = []
         self._from_waveform = recording.pulse_times is None and recording.tach is not None
         self._orders: tuple[float, ...] = ()
-        self._largest = 0.0  # pulse time as recorded, s: the larger, the coarser its last digit
+        self._largest = math.nan  # s, pulse time as recorded: the larger, the coarser its digits
         self._other_rate = 0.0  # with which the vibration is as long as the pulses
 
     def run(self) -> KeyphasorCheck:

@@ -121,7 +121,7 @@ def write_baseline(path: Path, machine: str, monitors: Mapping[str, ShaftMonitor
                              f'{error.strerror or error}') from error
 
 
-def read_baseline(path: Path, machine: str, settings: Settings, share: float = 1.0
+def read_baseline(path: Path, machine: str, settings: Settings, share: float
                   ) -> dict[str, ShaftMonitor]:
     """
     Return the monitors of the shafts of a machine as a file has them, {} where there is no file.

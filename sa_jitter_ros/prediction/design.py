@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, unwrapped
+from sa_jitter_ros.prediction.amplitudes import line_variance, unit_amplitudes
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.comb import Leakage, leakage
 from sa_jitter_ros.prediction.influence import KnownGain
@@ -169,8 +170,9 @@ def design(*, orders: Sequence[float], trigger_speed: float, maximum_loss: float
 
 def loss_and_variation(model: DeclaredModel) -> tuple[Array, Array]:
     """Return the loss and the coefficient of variation of each of a model's orders."""
-    prediction = predict(model)
-    return prediction.loss, prediction.standard_deviation / prediction.mean_attenuation
+    amplitudes = unit_amplitudes(model, ())
+    found = amplitudes.distribution(np.arange(len(model.orders)), noise=line_variance(model, ()))
+    return 1.0 - np.abs(amplitudes.moments.mean), np.sqrt(found.variance) / found.mean
 
 
 def required_keyphasor_rate(model: DeclaredModel, maximum_loss: float) -> float:
