@@ -20,8 +20,8 @@ from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.expectation import expect, Lines, Memory
 from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
-from sa_jitter_ros.inference.scoring import STEADY
 from sa_jitter_ros.inference.trace import trace
+from sa_jitter_ros.inference.unsteady import SCATTER
 from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -98,7 +98,7 @@ def test_large_unexplained_scatter_stays_unexplained(recording, observation, rng
     found = trace([drifting(observation, 0.08, rng)], [recording])
     assert found.verdict == 'unexplained'
     assert found.findings == ()
-    assert found.unsteadiness == pytest.approx(STEADY, rel=1e-12)
+    assert found.unsteadiness == pytest.approx(SCATTER, rel=1e-12)
     assert found.after.chi2_per_dof > 5.0
 
 

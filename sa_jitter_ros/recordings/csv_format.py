@@ -92,7 +92,7 @@ def _clock(layout: CsvLayout, values: FloatArray, sample_rate: float | None
         row = int(astray[0])
         raise RecordingError(
             f'row {row}: time {times[row]} s does not fit a constant rate of {rate:g} Hz from '
-            f'{start} s: split the file at its gaps')
+            f'{start} s: split the file at its gaps; of edges, save pulse_times in a .npz')
     return start, rate
 
 
