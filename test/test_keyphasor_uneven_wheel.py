@@ -16,6 +16,7 @@ import sa_jitter_ros as sa
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import number_and_patterns
+from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 pytestmark = pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
@@ -88,6 +89,8 @@ def test_what_is_found_is_averaged_without_loss(rng):
     check = check_keyphasor(recording)
     assert check.findings['spurious'].value['count'] == 0
     declared = machine_parameters(check)['synchronous_averager']
+    assert not doubts(recording, pulses, orders=(1.0, 5.0, 24.0), pulses_per_revolution=13,
+                      target_geometry='given', target_angles=declared['target_angles'])
     averages = sa.average(samples, rate, pulses, orders=[1.0, 5.0, 24.0], **{
         name: declared[name] for name in (
             'pulses_per_revolution', 'trigger_cycles', 'target_geometry', 'target_angles')})

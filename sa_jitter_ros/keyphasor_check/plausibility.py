@@ -49,12 +49,13 @@ _OTHER_SIZE, _SURE = 3.0, 4.0  # times as large; standard errors
 def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[float] = (),
            ratio: float = 1.0, pulses_per_revolution: int = 1,
            pulses_per_trigger: int | None = None, missing_teeth: int = 0,
-           jitter_std: float | None = None) -> tuple[str, ...]:
+           jitter_std: float | None = None, **geometry: Any) -> tuple[str, ...]:
     """
     Return what contradicts each other in a recording and its declaration, a sentence each.
 
     `pulses` (n,) are its pulse times in s, None if it has none; `orders` are those in which the
-    user is interested, `jitter_std` in s is the declared one.
+    user is interested, `jitter_std` in s is the declared one; `geometry` are `target_geometry` and
+    `target_angles` of `PulseValidator`, if given.
 
     >>> from sa_jitter_ros.recordings.recording import ArraySource
     >>> time = np.arange(20_000) / 2e3
@@ -73,12 +74,12 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
         return (mistake,)
     found = [*filter(None, [other_span(pulses, start, end)])]
     target = {'pulses_per_revolution': pulses_per_revolution, 'missing_teeth': missing_teeth,
-              'pulses_per_trigger': pulses_per_trigger}
+              'pulses_per_trigger': pulses_per_trigger, **geometry}
     unfit = _unfit(pulses, target)
     found += unfit
     if orders and not unfit:  # which has one cause with it
         found += weak_orders(recording, pulses, orders, ratio=ratio, **target)
-    if jitter_std:
+    if jitter_std and not geometry:
         found += _other_jitter(pulses, jitter_std)
     return tuple(found)
 
