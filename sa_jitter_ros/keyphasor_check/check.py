@@ -31,8 +31,7 @@ from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
     usual_marks)
-from sa_jitter_ros.keyphasor_check.marks import (
-    fit_pulses, FittedPulses, number_and_patterns)
+from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses, number_and_patterns
 from sa_jitter_ros.keyphasor_check.result import Checked, KeyphasorCheck, Warn
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, NumberedPulses
 from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter

@@ -37,8 +37,8 @@ _WEIGHTS = ((1.0,), (-1.0, 2.0), (1.0 / REACH,) * REACH, tuple(_LINE.tolist()))
 _LINES = _WEIGHTS[1::2]
 _ALL_WEIGHTS = np.array([(0.0,) * (REACH - len(item)) + item for item in _WEIGHTS])
 _LARGEST = 700.0  # whose exponential is finite
-# Standard deviations within which an interval is regular: one of 1e9 normal ones is not.
-_WIDTH = 6.0
+#: Standard deviations within which an interval is regular: one of 1e9 normal ones is not.
+WIDTH = 6.0
 _BELIEVED = 3.0  # standard deviations that a given tolerance stands for at least
 _WIDEST = 0.45  # of an interval: from a half on a missing pulse looks like a late one
 _UNSTEADY, _HIDING = 0.6, 0.15  # of a speed that scatters; and that hides a missing pulse
@@ -148,7 +148,7 @@ class IntervalModel:
     @property
     def predictions(self) -> list[LevelPrediction]:
         """Return the predictions, each with how unlikely it is to be the best one."""
-        variance = np.maximum(self._variance, (self._floor / _WIDTH)**2)
+        variance = np.maximum(self._variance, (self._floor / WIDTH)**2)
         prices = np.minimum(OTHER, 0.5 * self.degrees * np.log(variance / variance.min()))
         if self._settling:
             prices[:] = 0.0
@@ -230,13 +230,13 @@ class IntervalModel:
         #: standard deviation of the error of a prediction, relative to the interval
         learnt = math.sqrt(total / (_PRIOR_COUNT + self.degrees)) * (
             1.0 + _UNCERTAIN / self.degrees)
-        self.scatter = max(learnt, self._floor / _WIDTH,
-                           (_TICKS[self.chosen] + self._of_marks) * self.tick / _WIDTH)
+        self.scatter = max(learnt, self._floor / WIDTH,
+                           (_TICKS[self.chosen] + self._of_marks) * self.tick / WIDTH)
         if self.given:
             self.scatter = min(self.scatter, self.given / _BELIEVED)
         #: the speed scatters so much that a missing pulse does not show
         self.hides_missing = self.unsteady and self.scatter > _HIDING
-        widest = _WIDTH * self.scatter
+        widest = WIDTH * self.scatter
         if not self.hides_missing:
             widest = min(widest, _WIDEST)
         #: a deviation up to this is regular

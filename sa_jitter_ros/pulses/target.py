@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.pulses.interval_model import WIDTH
 from sa_jitter_ros.pulses.mark_pattern import MarkPattern
 from sa_jitter_ros.pulses.pulse_chain import (
     Chain, find_chain, STRAY_OF_MARKS, STRAY_OF_ONE, unsteadiness)
@@ -40,7 +41,6 @@ _DOUBLE = 0.5
 # The gap must still be distinguished from one that is a tooth wider or narrower.
 _BESIDE_GAP = 0.45
 _ACROSS_GAP = 0.9  # teeth
-_STANDARD = 6.0  # standard deviations within which a deviation is regular
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Lock:
 
 def _of_narrow(widths: FloatArray, scatter: float) -> FloatArray:
     """Return deviations (m,) that a scatter of whole intervals explains in narrower ones."""
-    return np.where(widths < 1.0, _STANDARD * scatter / widths, 0.0)
+    return np.where(widths < 1.0, WIDTH * scatter / widths, 0.0)
 
 
 def index_of(steps: IntArray) -> int:
