@@ -63,6 +63,7 @@ setup(
     package_data={NAME: ['py.typed', 'nodes/live_view_page/*'], f'{NAME}.inner_loops': ['*.pyi']},
     # Without a C compiler numpy and scipy do the same, in a few times the time.
     ext_modules=[Extension(f'{NAME}.inner_loops._in_c', [f'{NAME}/inner_loops/_in_c.c'],
+                           depends=[f'{NAME}/inner_loops/loops.h'],
                            extra_compile_args=['-O3'], optional=True)],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The loops over all samples: in C and in numpy, against sums in plain terms."""
+"""The loops over all samples, in numpy and in C with each width of vectors, against plain sums."""
 
 from importlib import import_module, util
 
@@ -18,8 +18,26 @@ import pytest
 
 COMPILED = 'sa_jitter_ros.inner_loops._in_c'
 needs_c = pytest.mark.skipif(util.find_spec(COMPILED) is None, reason='no C compiler')
-BOTH = pytest.mark.parametrize('name', [
-    'sa_jitter_ros.inner_loops.in_numpy', pytest.param(COMPILED, marks=needs_c)])
+WIDTHS = [lanes for lanes in (2, 4, 8) if util.find_spec(COMPILED)
+          and import_module(COMPILED).take_lanes(lanes) == lanes]
+ALL = pytest.mark.parametrize('lanes', [pytest.param(0, id='numpy'), *WIDTHS])
+
+
+@pytest.fixture(autouse=True)
+def widest_vectors():
+    """Leave the loops as they are taken at the start."""
+    yield
+    if WIDTHS:
+        import_module(COMPILED).take_lanes(8)
+
+
+def loops(lanes):
+    """Return the loops in C with vectors of so many numbers, those in numpy for 0."""
+    if not lanes:
+        return import_module('sa_jitter_ros.inner_loops.in_numpy')
+    compiled = import_module(COMPILED)
+    compiled.take_lanes(lanes)
+    return compiled
 
 
 def arrays(rng, *, rows, points, channels, half, order=8, samples=300):
@@ -38,14 +56,14 @@ def change(arrays_, which, value):
 
 # --- weighted sums -------------------------------------------------------------------------------
 
-@BOTH
+@ALL
 @given(channels=st.integers(1, 70), half=st.integers(1, 60), order=st.integers(2, 9),
        rows=st.integers(1, 5), points=st.integers(1, 9), seed=st.integers(0, 1000))
-def test_sums_are_those_of_the_definition(name, channels, half, order, rows, points, seed):
+def test_sums_are_those_of_the_definition(lanes, channels, half, order, rows, points, seed):
     given_ = arrays(np.random.default_rng(seed), rows=rows, points=points, channels=channels,
                     half=half, order=order)
     samples, origin, begin, length, u, polynomials, values = given_
-    import_module(name).weighted_sums(*given_)
+    loops(lanes).weighted_sums(*given_)
     places = (begin[:, None] + length[:, None] * u).ravel()
     first = np.repeat(origin, points) + places.astype(int)
     x = 2.0 * (places % 1.0) - 1.0
@@ -57,12 +75,12 @@ def test_sums_are_those_of_the_definition(name, channels, half, order, rows, poi
                                    atol=1e-11 * order * half)
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize('channels', [1, 3, 64])
-def test_sums_are_the_same_however_many_are_made_together(name, channels, rng):
+def test_sums_are_the_same_however_many_are_made_together(lanes, channels, rng):
     given_ = arrays(rng, rows=50, points=100, channels=channels, half=8)
     samples, *rows, u, polynomials, values = given_
-    weighted_sums = import_module(name).weighted_sums
+    weighted_sums = loops(lanes).weighted_sums
     weighted_sums(*given_)
     alone = np.empty((1, channels))
     for k in (0, 1, 2047, 2048, 4999):
@@ -103,22 +121,22 @@ LAYOUTS = {
     'each second': lambda x: np.repeat(np.repeat(x, 2, axis=0), 2, axis=1)[::2, ::2]}
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize('layout', LAYOUTS)
 @given(channels=st.integers(1, 20), count=st.integers(1, 150), seed=st.integers(0, 99))
-def test_frames_are_the_samples_in_the_other_order(name, layout, channels, count, seed):
+def test_frames_are_the_samples_in_the_other_order(lanes, layout, channels, count, seed):
     samples = np.random.default_rng(seed).standard_normal((channels, count))
     values = np.full((count, channels), np.nan)
-    assert import_module(name).frames(LAYOUTS[layout](samples), values) is True
+    assert loops(lanes).frames(LAYOUTS[layout](samples), values) is True
     np.testing.assert_array_equal(values, samples.T)
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize('layout', LAYOUTS)
 @pytest.mark.parametrize('bad', [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize('shape', [(1, 77), (3, 77), (8, 64), (19, 77)])
-def test_a_number_that_is_not_finite_is_seen_everywhere(name, layout, bad, shape, rng):
-    frames = import_module(name).frames
+def test_a_number_that_is_not_finite_is_seen_everywhere(lanes, layout, bad, shape, rng):
+    frames = loops(lanes).frames
     for place in [(0, 0), (shape[0] - 1, shape[1] - 1),
                   *zip(rng.integers(0, shape[0], 20), rng.integers(0, shape[1], 20))]:
         samples = np.full(shape, 1e308)
@@ -138,9 +156,9 @@ def test_frames_in_c_are_within_the_arrays(rng):
 
 # --- steps and products --------------------------------------------------------------------------
 
-@BOTH
+@ALL
 @given(shape=st.lists(st.integers(1, 21), min_size=2, max_size=3), seed=st.integers(0, 99))
-def test_steps_and_their_squares_are_added(name, shape, seed):
+def test_steps_and_their_squares_are_added(lanes, shape, seed):
     rng = np.random.default_rng(seed)
     every = rng.standard_normal((shape[0], *shape[1:]))
     wide = np.concatenate([every, every], axis=1)
@@ -148,38 +166,38 @@ def test_steps_and_their_squares_are_added(name, shape, seed):
     expected = total + (every - first).sum(axis=0), squares + ((every - first)**2).sum(axis=0)
     for values in (every, wide[:, :shape[1]]):
         found = total.copy(), squares.copy()
-        import_module(name).add_steps(values, first, *found)
+        loops(lanes).add_steps(values, first, *found)
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-@BOTH
+@ALL
 @given(lines=st.integers(1, 15), rows=st.integers(1, 9), size=st.integers(1, 70),
        count=st.integers(1, 3), seed=st.integers(0, 99))
-def test_products_are_added(name, lines, rows, size, count, seed):
+def test_products_are_added(lanes, lines, rows, size, count, seed):
     rng = np.random.default_rng(seed)
     wide, values = rng.standard_normal((lines, rows + 3)), rng.standard_normal((count, rows, size))
     sums = rng.standard_normal((count, lines, size))
     table = wide[:, 2:2 + rows]
     expected = sums + np.einsum('lr,krn->kln', table, values)
-    import_module(name).add_products(table, values, sums)
+    loops(lanes).add_products(table, values, sums)
     np.testing.assert_allclose(sums, expected, atol=1e-12)
 
 
 @needs_c
 def test_steps_and_products_in_c_are_within_the_arrays():
-    loops, values, item = import_module(COMPILED), np.ones((4, 5, 6)), np.ones((5, 6))
+    compiled, values, item = import_module(COMPILED), np.ones((4, 5, 6)), np.ones((5, 6))
     for given_ in ((values, item[:4], item, item), (values, item, item[:, :5], item),
                    (values, item, item, item.ravel()[:29]), (values[:, :, ::2], item, item, item),
                    (values, np.asfortranarray(item), item, item),
                    (values.astype(complex), item, item, item)):
         with pytest.raises(ValueError, match='do not fit'):
-            loops.add_steps(*given_)
+            compiled.add_steps(*given_)
     table, sums = np.ones((2, 5)), np.ones((4, 2, 6))
     for given_ in ((table[:, :4], values, sums), (table, values[:3], sums),
                    (table, values, sums[:, :1]), (table, values, sums[:, :, :5]),
                    (table[0], values, sums), (table, values[0], sums),
                    (table.astype(np.float32), values, sums)):
         with pytest.raises(ValueError, match='do not fit'):
-            loops.add_products(*given_)
+            compiled.add_products(*given_)
     with pytest.raises(ValueError, match='read-only'):
-        loops.add_products(table, values, np.broadcast_to(sums, sums.shape))
+        compiled.add_products(table, values, np.broadcast_to(sums, sums.shape))

@@ -101,11 +101,11 @@ def test_docstrings_are_checked_as_ament_pep257_does():
 
 def test_every_file_states_copyright_and_licence():
     names = [path for source in SOURCES for path in sorted((ROOT / source).glob('**/*'))
-             if path.suffix in ('.c', '.py', '.pyi') and '.venv' not in path.parts]
+             if path.suffix in ('.c', '.h', '.py', '.pyi') and '.venv' not in path.parts]
     assert len(names) > 200
     in_c = HEADER.replace('# ', '// ').replace('#\n', '//\n')
     assert [path for path in names if not path.read_text('utf-8').startswith(
-        in_c if path.suffix == '.c' else HEADER)] == []
+        in_c if path.suffix in ('.c', '.h') else HEADER)] == []
 
 
 def test_ament_copyright():

@@ -11,7 +11,7 @@
 /* The loops over all samples: what in_numpy.py does where this is not compiled.
  *
  * What is added up stays in registers, where numpy and scipy load and store it once for each
- * number, and each array is read once.
+ * number, and each array is read once. Here arrays are taken from Python; loops.h has the loops.
  */
 
 #define PY_SSIZE_T_CLEAN
@@ -20,26 +20,77 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* One version for each width of vectors; the loader takes the widest that the processor has. */
+/* Places of the sums: `count` u in each of the rows. */
+struct places {
+    const int32_t *origin;
+    const double *begin, *length, *u;
+    Py_ssize_t rows, count;
+};
+
+/* The loops of loops.h, with vectors of so many numbers. */
+struct loops {
+    long lanes;
+    int (*weighted_sums)(const double *samples, Py_ssize_t channels, Py_ssize_t last,
+                         const struct places *at, const double *table, double *room,
+                         Py_ssize_t order, Py_ssize_t half, double *values);
+    int (*frames)(const char *samples, Py_ssize_t channels, Py_ssize_t count,
+                  Py_ssize_t channel_step, Py_ssize_t step, double *values);
+    int (*copied)(const double *samples, Py_ssize_t count, double *values);
+    void (*add_steps)(const char *values, Py_ssize_t count, Py_ssize_t apart, Py_ssize_t size,
+                      const double *first, double *sum, double *squares);
+    void (*add_products)(const double *table, Py_ssize_t lines, Py_ssize_t apart, Py_ssize_t rows,
+                         const double *values, Py_ssize_t size, double *sums);
+};
+
+/* Vectors wider than the registers would be kept in memory, which takes ten times as long: the
+ * loops are compiled for each width, and the widest that the processor has is taken. */
+#define LANES 2
+#define NAMED(name) name##_of_two
+#include "loops.h"
+
 #if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && __GNUC__ >= 12
-#define FOR_EACH_PROCESSOR \
-    __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#define LANES 4
+#define NAMED(name) name##_of_four
+#pragma GCC push_options
+#pragma GCC target("arch=x86-64-v3")
+#include "loops.h"
+#pragma GCC pop_options
+
+#define LANES 8
+#define NAMED(name) name##_of_eight
+#pragma GCC push_options
+#pragma GCC target("arch=x86-64-v4")
+#include "loops.h"
+#pragma GCC pop_options
+
+/* The loops with the widest vectors that the processor has, of at most so many numbers. */
+static const struct loops *widest(long lanes)
+{
+    __builtin_cpu_init();
+    if (lanes >= 8 && __builtin_cpu_supports("x86-64-v4"))
+        return &loops_of_eight;
+    if (lanes >= 4 && __builtin_cpu_supports("x86-64-v3"))
+        return &loops_of_four;
+    return &loops_of_two;
+}
 #else
-#define FOR_EACH_PROCESSOR
+static const struct loops *widest(long lanes)
+{
+    (void)lanes;
+    return &loops_of_two;
+}
 #endif
 
-#define INLINE static inline __attribute__((always_inline))
+static const struct loops *loops;
 
-/* Neighbouring numbers, at any address. */
-typedef double eight __attribute__((vector_size(64), aligned(8), may_alias));
-typedef double aligned __attribute__((vector_size(64), may_alias));
-typedef double four __attribute__((vector_size(32), aligned(8), may_alias));
-typedef double two __attribute__((vector_size(16), aligned(8), may_alias));
-typedef double one __attribute__((may_alias));
-
-INLINE double total(eight sum)
+static PyObject *take_lanes(PyObject *self, PyObject *most)
 {
-    return ((sum[0] + sum[4]) + (sum[2] + sum[6])) + ((sum[1] + sum[5]) + (sum[3] + sum[7]));
+    (void)self;
+    const long lanes = PyLong_AsLong(most);
+    if (lanes == -1 && PyErr_Occurred())
+        return NULL;
+    loops = widest(lanes);
+    return PyLong_FromLong(loops->lanes);
 }
 
 /* --- what arrays are given --- */
@@ -105,112 +156,6 @@ static PyObject *give_back(Py_buffer *views, int count, int fitted, PyObject *re
 
 /* --- weighted sums: of samples, whose weights are polynomials --- */
 
-/* The sums of some neighbouring channels, in four parts that do not wait for each other. */
-#define ADD_UP(type) do { \
-    const type zero = {0.0}; \
-    type sum[4] = {zero, zero, zero, zero}; \
-    const double *row = first + c; \
-    Py_ssize_t k = 0; \
-    for (; k + 4 <= taps; k += 4, row += 4 * channels) { \
-        sum[0] += weights[k] * *(const type *)row; \
-        sum[1] += weights[k + 1] * *(const type *)(row + channels); \
-        sum[2] += weights[k + 2] * *(const type *)(row + 2 * channels); \
-        sum[3] += weights[k + 3] * *(const type *)(row + 3 * channels); \
-    } \
-    for (; k < taps; k++, row += channels) \
-        sum[0] += weights[k] * *(const type *)row; \
-    *(type *)(values + c) = (sum[0] + sum[1]) + (sum[2] + sum[3]); \
-} while (0)
-
-/* Samples from the first of a sum to what is fetched from the memory, which takes that long. */
-#define AHEAD 64
-
-/* Places of the sums: `count` u in each of the rows. */
-struct places {
-    const int32_t *origin;
-    const double *begin, *length, *u;
-    Py_ssize_t rows, count;
-};
-
-/* `table` holds the polynomials of the first half of the weights, the lowest power first, in rows
- * of `width` numbers that begin at a multiple of 64 bytes: zeros and the `half`; `room` is that of
- * the weights between as many zeros. Weights of the second half are those of the first, in the
- * other order, with the odd powers taken away. Returns 0 if a sum is not within the samples, of
- * which it may begin at the `last`. */
-INLINE int sums(const double *samples, const Py_ssize_t channels, Py_ssize_t last,
-                const struct places *at, const double *restrict table, double *restrict room,
-                const Py_ssize_t order, const Py_ssize_t half, double *restrict values)
-{
-    typedef int64_t lanes __attribute__((vector_size(64)));
-    const lanes turned = {7, 6, 5, 4, 3, 2, 1, 0};
-    const Py_ssize_t width = (half + 7) / 8 * 8;
-    const double *weights = room + width - half;
-    const struct places p = *at;
-    const Py_ssize_t size = p.rows * p.count, taps = 2 * half;
-    for (Py_ssize_t i = 0, row = 0, column = 0; i < size; i++, values += channels) {
-        const double place = p.begin[row] + p.length[row] * p.u[column];
-        if (!(place >= 0.0 && place <= INT32_MAX))
-            return 0;
-        const int32_t whole = (int32_t)place;
-        const Py_ssize_t index = p.origin[row] + (Py_ssize_t)whole;
-        if (index < 0 || index > last)
-            return 0;
-        if (++column == p.count) {
-            column = 0;
-            row++;
-        }
-        const double *first = samples + index * channels;
-        const double x = 2.0 * (place - whole) - 1.0, square = x * x;
-        Py_ssize_t t, c = 0;
-        for (t = 0; t < width; t += 8) {
-            const double *power = table + (order - 2) * width + t;
-            eight even = *(const aligned *)power, odd = *(const aligned *)(power + width);
-            for (Py_ssize_t k = order - 2; k > 0; k -= 2) {
-                power -= 2 * width;
-                even = even * square + *(const aligned *)power;
-                odd = odd * square + *(const aligned *)(power + width);
-            }
-            odd *= x;
-            const eight second = even - odd;
-            *(aligned *)(room + t) = even + odd;
-            *(aligned *)(room + 2 * width - 8 - t) = __builtin_shuffle(second, turned);
-        }
-        if (channels == 1) {
-            eight sum = {0.0};
-            for (t = 0; t + 8 <= taps; t += 8)
-                sum += *(const eight *)(weights + t) * *(const eight *)(first + t);
-            for (; t < taps; t++)
-                sum[t % 8] += weights[t] * first[t];
-            *values = total(sum);
-            continue;
-        }
-        for (; c + 8 <= channels; c += 8) {
-            __builtin_prefetch(first + AHEAD * channels + c);
-            ADD_UP(eight);
-        }
-        for (; c + 4 <= channels; c += 4)
-            ADD_UP(four);
-        for (; c + 2 <= channels; c += 2)
-            ADD_UP(two);
-        for (; c < channels; c++)
-            ADD_UP(one);
-    }
-    return 1;
-}
-
-/* What is known to the compiler stays in registers: the default interpolator, one channel. */
-FOR_EACH_PROCESSOR
-static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t last,
-                         const struct places *at, const double *table, double *room,
-                         Py_ssize_t order, Py_ssize_t half, double *values)
-{
-    if (order == 8 && half == 8 && channels == 1)
-        return sums(samples, 1, last, at, table, room, 8, 8, values);
-    if (order == 8 && half == 8)
-        return sums(samples, channels, last, at, table, room, 8, 8, values);
-    return sums(samples, channels, last, at, table, room, order, half, values);
-}
-
 static int fit(const Py_buffer *samples, const Py_buffer *origin, const Py_buffer *begin,
                const Py_buffer *length, const Py_buffer *u, const Py_buffer *polynomials,
                const Py_buffer *values)
@@ -238,9 +183,9 @@ static int compute(Py_buffer *views)
     memset(table, 0, (order + 2) * width * sizeof(double));
     for (Py_ssize_t k = 0; k < powers; k++)
         memcpy(table + (k + 1) * width - half, polynomials + k * half, half * sizeof(double));
-    const int inside = weighted_sums(views[0].buf, views[0].shape[1],
-                                     views[0].shape[0] - 2 * half, &at, table,
-                                     table + order * width, order, half, views[6].buf);
+    const int inside = loops->weighted_sums(views[0].buf, views[0].shape[1],
+                                            views[0].shape[0] - 2 * half, &at, table,
+                                            table + order * width, order, half, views[6].buf);
     free(table);
     return inside;
 }
@@ -264,79 +209,6 @@ static PyObject *take_weighted_sums(PyObject *self, PyObject *const *given, Py_s
 
 /* --- frames: samples (channel, n) to (n, channel), whether all are finite --- */
 
-#define EXCHANGE(a, b, low, high) do { \
-    const eight first = a, second = b; \
-    a = __builtin_shuffle(first, second, low); \
-    b = __builtin_shuffle(first, second, high); \
-} while (0)
-
-/* Eight samples of eight channels. */
-INLINE void transpose(eight *row)
-{
-    typedef int64_t places __attribute__((vector_size(64)));
-    const places low1 = {0, 8, 2, 10, 4, 12, 6, 14}, high1 = {1, 9, 3, 11, 5, 13, 7, 15};
-    const places low2 = {0, 1, 8, 9, 4, 5, 12, 13}, high2 = {2, 3, 10, 11, 6, 7, 14, 15};
-    const places low4 = {0, 1, 2, 3, 8, 9, 10, 11}, high4 = {4, 5, 6, 7, 12, 13, 14, 15};
-    for (int k = 0; k < 8; k += 2)
-        EXCHANGE(row[k], row[k + 1], low1, high1);
-    for (int k = 0; k < 8; k++)
-        if (!(k & 2))
-            EXCHANGE(row[k], row[k + 2], low2, high2);
-    for (int k = 0; k < 4; k++)
-        EXCHANGE(row[k], row[k + 4], low4, high4);
-}
-
-/* Steps are in bytes. What is not finite makes the sum of 0 times all numbers NaN. */
-FOR_EACH_PROCESSOR
-static int frames(const char *samples, Py_ssize_t channels, Py_ssize_t count,
-                  Py_ssize_t channel_step, Py_ssize_t step, double *values)
-{
-    const Py_ssize_t many = step == sizeof(double) ? channels / 8 * 8 : 0, tile = 2048;
-    eight zero = {0.0}, row[8];
-    double sum = 0.0;
-    for (Py_ssize_t begin = 0; begin < count; begin += tile) {
-        const Py_ssize_t end = begin + tile < count ? begin + tile : count;
-        for (Py_ssize_t c = 0; c < channels; c += c < many ? 8 : 1) {
-            const char *first = samples + c * channel_step;
-            Py_ssize_t s = begin;
-            for (; c < many && s + 8 <= end; s += 8) {
-                for (int k = 0; k < 8; k++) {
-                    row[k] = *(const eight *)(first + k * channel_step + s * step);
-                    zero += row[k] * 0.0;
-                }
-                transpose(row);
-                for (int k = 0; k < 8; k++)
-                    *(eight *)(values + (s + k) * channels + c) = row[k];
-            }
-            for (; s < end; s++)
-                for (Py_ssize_t k = 0; k < (c < many ? 8 : 1); k++) {
-                    const double value = *(const double *)(first + k * channel_step + s * step);
-                    values[s * channels + c + k] = value;
-                    sum += value * 0.0;
-                }
-        }
-    }
-    return sum + total(zero) == 0.0;
-}
-
-/* Samples that are in the order of frames. */
-FOR_EACH_PROCESSOR
-static int copied(const double *samples, Py_ssize_t count, double *values)
-{
-    eight zero = {0.0};
-    Py_ssize_t i = 0;
-    for (; i + 8 <= count; i += 8) {
-        const eight part = *(const eight *)(samples + i);
-        *(eight *)(values + i) = part;
-        zero += part * 0.0;
-    }
-    for (; i < count; i++) {
-        values[i] = samples[i];
-        zero[0] += samples[i] * 0.0;
-    }
-    return total(zero) == 0.0;
-}
-
 static PyObject *take_frames(PyObject *self, PyObject *const *given, Py_ssize_t number)
 {
     (void)self;
@@ -353,39 +225,15 @@ static PyObject *take_frames(PyObject *self, PyObject *const *given, Py_ssize_t 
         const Py_ssize_t channel_step = samples->strides[0], step = samples->strides[1];
         Py_BEGIN_ALLOW_THREADS
         if ((channels == 1 || channel_step == 8) && step == 8 * channels)
-            finite = copied(samples->buf, channels * count, values->buf);
+            finite = loops->copied(samples->buf, channels * count, values->buf);
         else
-            finite = frames(samples->buf, channels, count, channel_step, step, values->buf);
+            finite = loops->frames(samples->buf, channels, count, channel_step, step, values->buf);
         Py_END_ALLOW_THREADS
     }
     return give_back(views, 2, fitted, finite ? Py_True : Py_False);
 }
 
 /* --- add steps: from the first of some arrays to all of them, and their squares --- */
-
-#define ADD_STEPS(type) do { \
-    const type begin = *(const type *)(first + i); \
-    type step = {0.0}, total = step, power = step; \
-    for (Py_ssize_t k = 0; k < count; k++) { \
-        step = *(const type *)(values + k * apart + i * sizeof(double)) - begin; \
-        total += step; \
-        power += step * step; \
-    } \
-    *(type *)(sum + i) += total; \
-    *(type *)(squares + i) += power; \
-} while (0)
-
-/* The arrays are `apart` bytes from each other. */
-FOR_EACH_PROCESSOR
-static void add_steps(const char *values, Py_ssize_t count, Py_ssize_t apart, Py_ssize_t size,
-                      const double *first, double *sum, double *squares)
-{
-    Py_ssize_t i = 0;
-    for (; i + 8 <= size; i += 8)
-        ADD_STEPS(eight);
-    for (; i < size; i++)
-        ADD_STEPS(one);
-}
 
 static PyObject *take_steps(PyObject *self, PyObject *const *given, Py_ssize_t number)
 {
@@ -401,53 +249,14 @@ static PyObject *take_steps(PyObject *self, PyObject *const *given, Py_ssize_t n
                 || views[k].strides[0] == 8 * size_from(&views[k], 1));
     if (fitted) {
         Py_BEGIN_ALLOW_THREADS
-        add_steps(views[0].buf, views[0].shape[0], views[0].strides[0], size, views[1].buf,
-                  views[2].buf, views[3].buf);
+        loops->add_steps(views[0].buf, views[0].shape[0], views[0].strides[0], size, views[1].buf,
+                         views[2].buf, views[3].buf);
         Py_END_ALLOW_THREADS
     }
     return give_back(views, 4, fitted, Py_None);
 }
 
 /* --- add products: of a table with the rows of some arrays --- */
-
-/* Some lines of the table; the compiler knows how many, and keeps their sums in registers. */
-INLINE void some_lines(const int lines, const double *table, Py_ssize_t apart, Py_ssize_t rows,
-                       const double *values, Py_ssize_t size, double *sums)
-{
-    Py_ssize_t i = 0;
-    for (; i + 16 <= size; i += 16) {
-        eight sum[6][2];
-        for (int j = 0; j < lines; j++)
-            for (int h = 0; h < 2; h++)
-                sum[j][h] = *(const eight *)(sums + j * size + i + 8 * h);
-        for (Py_ssize_t r = 0; r < rows; r++)
-            for (int h = 0; h < 2; h++) {
-                const eight value = *(const eight *)(values + r * size + i + 8 * h);
-                for (int j = 0; j < lines; j++)
-                    sum[j][h] += table[j * apart + r] * value;
-            }
-        for (int j = 0; j < lines; j++)
-            for (int h = 0; h < 2; h++)
-                *(eight *)(sums + j * size + i + 8 * h) = sum[j][h];
-    }
-    for (; i < size; i++)
-        for (Py_ssize_t r = 0; r < rows; r++)
-            for (int j = 0; j < lines; j++)
-                sums[j * size + i] += table[j * apart + r] * values[r * size + i];
-}
-
-/* The lines of the table are `apart` numbers from each other. */
-FOR_EACH_PROCESSOR
-static void add_products(const double *table, Py_ssize_t lines, Py_ssize_t apart, Py_ssize_t rows,
-                         const double *values, Py_ssize_t size, double *sums)
-{
-    for (; lines >= 6; lines -= 6, table += 6 * apart, sums += 6 * size)
-        some_lines(6, table, apart, rows, values, size, sums);
-    for (; lines >= 2; lines -= 2, table += 2 * apart, sums += 2 * size)
-        some_lines(2, table, apart, rows, values, size, sums);
-    if (lines)
-        some_lines(1, table, apart, rows, values, size, sums);
-}
 
 static PyObject *take_products(PyObject *self, PyObject *const *given, Py_ssize_t number)
 {
@@ -463,10 +272,11 @@ static PyObject *take_products(PyObject *self, PyObject *const *given, Py_ssize_
     if (fitted) {
         Py_BEGIN_ALLOW_THREADS
         for (Py_ssize_t k = 0; k < values->shape[0]; k++)
-            add_products(table->buf, table->shape[0], table->strides[0] / 8, table->shape[1],
-                         (const double *)((char *)values->buf + k * values->strides[0]),
-                         values->shape[2],
-                         (double *)((char *)sums->buf + k * sums->strides[0]));
+            loops->add_products(table->buf, table->shape[0], table->strides[0] / 8,
+                                table->shape[1],
+                                (const double *)((char *)values->buf + k * values->strides[0]),
+                                values->shape[2],
+                                (double *)((char *)sums->buf + k * sums->strides[0]));
         Py_END_ALLOW_THREADS
     }
     return give_back(views, 3, fitted, Py_None);
@@ -484,6 +294,8 @@ static PyMethodDef methods[] = {
            "add_steps(values, first, sum, squares)\n--\n\nSee in_numpy."),
     METHOD("add_products", take_products,
            "add_products(table, values, sums)\n--\n\nSee in_numpy."),
+    {"take_lanes", take_lanes, METH_O,
+     "take_lanes(most)\n--\n\nTake vectors of at most so many numbers; return how many they have."},
     {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef module = {
@@ -491,5 +303,6 @@ static struct PyModuleDef module = {
 
 PyMODINIT_FUNC PyInit__in_c(void)
 {
+    loops = widest(8);
     return PyModule_Create(&module);
 }

@@ -27,3 +27,6 @@ def add_steps(values: FloatArray, first: FloatArray, total: FloatArray, squares:
 
 
 def add_products(table: FloatArray, values: FloatArray, sums: FloatArray, /) -> None: ...
+
+
+def take_lanes(most: int, /) -> int: ...
