@@ -320,3 +320,24 @@ def test_a_strong_tone_of_the_supply_leads_no_error_astray(seed):
     z = (found.errors - (errors - errors.mean())) / found.standard_errors
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size))
     assert np.abs(found.tones - supply).min() < 0.01
+
+
+@pytest.mark.parametrize('swing', [0.02, 0.05, 0.1])
+def test_a_tone_that_the_speed_spreads_over_several_orders_is_one_tone(rng, swing):
+    """Over angle it is a line with sidebands, none of which a tone beside the others explains."""
+    speed, rate, tone = 40.0, 2000.0, 40.6
+    time = np.arange(int(20.0 * rate)) / rate
+    turns = speed * time + sum(
+        swing * np.sin(2.0 * np.pi * wave * time + wave) for wave in (0.07, 0.18))
+    samples = sum(size * np.cos(2.0 * np.pi * order * turns + order)
+                  for order, size in ((1.0, 1.8), (8.0, 0.6), (16.0, 1.7)))
+    samples += 0.15 * np.cos(2.0 * np.pi * tone * time + 1.0)
+    samples += 0.02 * rng.standard_normal(time.size)
+    times = np.interp(np.arange(turns[0] + 1.5, turns[-1] - 1.5), turns, time)
+    times += rng.normal(0.0, 2e-5, times.size)
+    found = OpenRecord(samples[:, None], rate, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[1.0, 8.0, 16.0], jitter_std=2e-5).fit()
+    assert found.orders.size == 3
+    assert found.tones == pytest.approx([tone], abs=1e-3)
+    error = found.amplitude_errors[0, 3]
+    assert np.abs(found.tone_amplitudes[0]) == pytest.approx([0.15], abs=4.0 * error)

@@ -279,17 +279,24 @@ def fit_lines(states: States) -> None:
     states.synchronous, states.movable = _synchronous(states)
 
 
-def let_stand(states: States) -> None:
-    """Make tones of the undeclared orders that show better over time than over angle."""
+def let_stand(states: States, *, searching: bool) -> None:
+    """
+    Make tones of the undeclared orders that show better over time than over angle.
+
+    Parts of a tone are taken out. While others are looked for, when `searching`, it takes one
+    that is new and certain.
+    """
     over_angle, over_time, tones = _both_ways(states)
-    standing = (over_time > over_angle) & ~states.synchronous[states.declared:states.orders.size]
-    if not standing.any():
+    standing = over_time > over_angle + searching * ODDS
+    standing &= ~states.synchronous[states.declared:states.orders.size]
+    apart, new = APART / float(np.ptp(states.place)), states.tones
+    for i in np.flatnonzero(standing)[np.argsort(-over_time[standing])].tolist():
+        if np.all(np.abs(new - tones[i]) > apart):  # else a part of the same
+            new = np.append(new, tones[i])
+    if not standing.any() or (searching and new.size == states.tones.size):
         return
     states.orders = states.orders[np.append(np.ones(states.declared, np.bool_), ~standing)]
-    apart = APART / float(np.ptp(states.place))
-    for i in np.flatnonzero(standing)[np.argsort(-over_time[standing])].tolist():
-        if np.all(np.abs(states.tones - tones[i]) > apart):  # else a part of the same
-            states.tones = np.append(states.tones, tones[i])
+    states.tones = new
     lines = states.orders.size + states.tones.size
     states.amplitudes = np.zeros((len(states.amplitudes), lines), np.complex128)
     fit_lines(states)
@@ -297,7 +304,12 @@ def let_stand(states: States) -> None:
 
 
 def _both_ways(states: States) -> tuple[Array, Array, Array]:
-    """Return the gain in log likelihood of undeclared orders, of tones near them, and these."""
+    """
+    Return the gain in log likelihood of undeclared orders, of tones near them, and these.
+
+    Either is to explain what the undeclared orders close to it do, too: a line that stands while
+    the speed varies makes several of them.
+    """
     states.make_tables()
     residual = states.residual()
     middle = states.place.mean(axis=1)
@@ -309,10 +321,13 @@ def _both_ways(states: States) -> tuple[Array, Array, Array]:
     over_angle, over_time, tones = np.zeros((3, count))
     sums = np.stack([states.sums(item) for item in residual])
     weights = states.weight / (states.whole.sum() * states.u.size)
-    for k, i in enumerate(range(states.declared, states.orders.size)):
-        wave, turn = states.wave[i], states.turn[:, i]
-        part = states.amplitudes[:, i, None] * turn  # (channel, cycle)
-        alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
+    own = np.arange(states.declared, states.orders.size)
+    for k, i in enumerate(own):
+        near = own[np.abs(states.orders[own] - states.orders[i]) * states.span < _SKIRT]
+        waves, turn = states.wave[near], states.turn[:, i]
+        parts = states.amplitudes[:, None, near] * states.turn[:, near]  # (channel, cycle, line)
+        alone = 0.5 * turn * (parts @ (waves @ states.wave[i])
+                              + parts.conj() @ (waves.conj() @ states.wave[i]))
         each = (sums[:, :, i] + alone).conj()
         over_angle[k] = weights @ np.abs(each.sum(axis=1)) ** 2
         away = states.orders[i] * (angle - states.frequency * middle)

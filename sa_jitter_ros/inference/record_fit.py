@@ -137,6 +137,7 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
             if look:
                 refine(states)
                 fit_lines(states)
+                let_stand(states, searching=True)
         elif states.all_free:
             if mended == _MOST_STEPS or not mend_slips(states):
                 break
@@ -149,7 +150,7 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
                 prune(states, _PRUNED_EARLY)
                 fit_lines(states)
     if look:
-        let_stand(states)
+        let_stand(states, searching=False)
         for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
             moved = refine(states)
             fit_lines(states)
