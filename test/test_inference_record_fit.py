@@ -341,3 +341,28 @@ def test_a_tone_that_the_speed_spreads_over_several_orders_is_one_tone(rng, swin
     assert found.tones == pytest.approx([tone], abs=1e-3)
     error = found.amplitude_errors[0, 3]
     assert np.abs(found.tone_amplitudes[0]) == pytest.approx([0.15], abs=4.0 * error)
+
+
+@pytest.mark.parametrize('wave', [0.01, 0.02, 0.035, 0.05, 0.08])
+def test_a_speed_that_swings_as_one_wave_makes_bends_and_no_sidebands(rng, wave):
+    """The curve that it makes in every cycle repeats with the turns of the swing and the shaft."""
+    speed, rate, count = 30.0, 3000.0, 500
+    time = np.arange(int((count + 3) / speed * rate)) / rate
+    size = 2e-3 / (2.0 * np.pi * wave) ** 2  # turns: a curve of 2e-3 in every cycle
+    turns = speed * time + size * np.sin(2.0 * np.pi * wave * speed * time)
+    samples = sum(level * np.cos(2.0 * np.pi * order * turns + order)
+                  for order, level in ((9.0, 1.0), (24.0, 2.0), (36.0, 1.0)))
+    samples += 0.03 * rng.standard_normal(time.size)
+    times = np.interp(np.arange(count) + 1.5, turns, time)
+    errors = rng.normal(0.0, 1e-3 / speed, count)
+    found = OpenRecord(samples[:, None], rate, 0.0, times + errors,
+                       measured=np.ones(count, bool), cycle_length=1.0,
+                       orders=[9.0, 24.0, 36.0], jitter_std=1e-3 / speed).fit()
+    sides = np.abs(found.orders[3:, None] - found.orders[:3])
+    assert not np.any(np.abs(sides - 1.0) < 1.5 * wave)
+    z = (found.errors - (errors - errors.mean())) / found.standard_errors
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.2)
+    middle = np.interp(np.arange(count - 1) + 2.0, turns, time)
+    bends = 4.0 * (0.5 * (times[1:] + times[:-1]) - middle)  # of u (1 - u), at its middle
+    off = found.bends[2:-2, 0] - (bends - bends.mean())[2:-2]
+    assert np.std(off) < 0.3 * np.std(bends)

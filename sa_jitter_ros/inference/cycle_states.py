@@ -41,8 +41,8 @@ from scipy.linalg import cho_solve
 Array = NDArray[np.float64]
 
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
-# Errors and bends in parts of the declared jitter, and gains: a first guess of bends and gains
-# when they become free, and the least that all keep always: a bend of nothing would be certain.
+# Errors and bends in parts of the declared jitter, and gains: a first guess of bends and gains,
+# and the least that all keep always: a bend of nothing would be certain.
 _FREE, _LEAST = 0.1, 1e-3
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
@@ -82,9 +82,9 @@ class States:
                                 np.ones(points), u])
         self.width = len(self.shapes) - 1
         self.states = np.zeros((times.size, self.width))
-        self.least = _LEAST * np.array([*[jitter_std] * (self.width - 2), 1.0])
-        self.size = np.append(jitter_std, self.least)
-        self.all_free = self.converged = False
+        units = np.array([*[jitter_std] * (self.width - 2), 1.0])
+        self.least, self.size = _LEAST * units, np.append(jitter_std, _FREE * units)
+        self.converged = False
         self.resolved = np.zeros(self.width)
         self.weight, self.around = np.ones(band.samples.shape[1]), np.ones(1)
         # pulses do not err by more than they scatter; a source that moves may do more
@@ -398,9 +398,8 @@ class States:
                                       1.0 - 1.0 / np.count_nonzero(self.measured))
         power = max(power, min(more, self.most_power), (_LEAST * self.jitter_std) ** 2)
         self.size[0] = np.sqrt(power)
-        if self.all_free:
-            for i, least in enumerate(self.least, start=1):
-                self.size[i] = np.sqrt(max(self._estimated(i, self.states[2:-2, i])[1], least**2))
+        for i, least in enumerate(self.least, start=1):
+            self.size[i] = np.sqrt(max(self._estimated(i, self.states[2:-2, i])[1], least**2))
 
     def _estimated(self, state: int, values: Array, share: float = 1.0) -> tuple[float, float]:
         """
@@ -419,11 +418,6 @@ class States:
         if gained > 0.0:
             gained /= resolved**2 if self.converged and not state else resolved
         return power, before + gained
-
-    def free_all(self) -> None:
-        """Let bends and gains free."""
-        self.all_free = True
-        self.size[1:] = _FREE * np.array([*[self.jitter_std] * (self.width - 2), 1.0])
 
     def amplitude_variances(self) -> Array:
         """Return the variances (channel, line) of real and imaginary part of the amplitudes."""

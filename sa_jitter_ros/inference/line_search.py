@@ -35,7 +35,7 @@ from scipy.special import gammaincc
 
 Array = NDArray[np.float64]
 
-_MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
+_MOST_LINES = 60  # undeclared ones
 # A line is not far below the strongest, which may leave images of itself.
 _SHARE = 0.3
 _HANN = 1.5  # bins of noise in one of the window
@@ -130,7 +130,7 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
     found.sort(reverse=True)
     orders: list[float] = []
     tones: list[float] = []
-    room = _MOST_LINES // (2 - states.all_free) - states.amplitudes[0, states.declared:].size
+    room = _MOST_LINES - states.amplitudes[0, states.declared:].size
     least_power = 0.0
     for size, place, tone in found:
         if size < least_power or len(orders) + len(tones) >= room:
@@ -248,7 +248,7 @@ def _synchronous(states: States) -> tuple[BoolArray, BoolArray]:
             known |= np.abs(others - size) < least
     over_angle, over_time, _ = _both_ways(states)
     none = np.zeros(states.tones.size, np.bool_)
-    sharper = np.append(over_angle > _SHARPER * over_time, none)
+    sharper = np.append(over_angle > (1.0 + _MISSED) * over_time + ODDS, none)
     stands = np.append(over_time > over_angle + ODDS, ~none)
     close = np.abs(others[:, None] - others) * states.span < _SKIRT
     alone = (np.count_nonzero(close, axis=1) < 2) | (np.abs(offset) * states.span < _SKIRT)
@@ -257,20 +257,6 @@ def _synchronous(states: States) -> tuple[BoolArray, BoolArray]:
     synchronous, movable = (np.append(own, np.any(alike & found, axis=1) | found)
                             for found in (known | sharper, known | alone))
     return synchronous, movable
-
-
-def with_a_shaft(states: States) -> BoolArray:
-    """
-    Tell which orders, and tones after them (line,), are certainly sharper over angle than time.
-
-    A shaft makes them, whatever its ratio: the speed that varies spreads them over time.
-    """
-    found = np.zeros(states.amplitudes.shape[1], np.bool_)
-    if states.orders.size > states.declared:
-        over_angle, over_time, _ = _both_ways(states)
-        found[states.declared:states.orders.size] = (
-            over_angle > (1.0 + _MISSED) * over_time + ODDS)
-    return found
 
 
 def fit_lines(states: States) -> None:

@@ -27,16 +27,17 @@ from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
-    add_lines, fit_lines, follow_trend, let_stand, new_lines, prune, refine, with_a_shaft)
+    add_lines, fit_lines, follow_trend, let_stand, new_lines, prune, refine)
 from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
 
 Array = NDArray[np.float64]
 
-# Steps that a search may take; what its last one may change, in standard errors.
-_MOST_STEPS, _SETTLED = 20, 0.1
-_PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
+# Steps before lines are looked for, which have to leave them no bends, and those that a search may
+# take; what its last one may change, in standard errors.
+_FIRST_STEPS, _MOST_STEPS, _SETTLED = 4, 20, 0.1
+_PRUNED = 4.0  # mean power of a line in its variances that keeps it
 # The last fit expects pulse errors that are so many times as large as they, or their standard
 # errors, are, so that they are hardly shrunk.
 _WEAK = 3.0
@@ -126,7 +127,8 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
     declared ones have shown.
     """
     look, lines, mended = known is None, known or ((), ()), 0
-    states.step()
+    for _ in range(_FIRST_STEPS):
+        states.step()
     while True:
         for _ in range(2):
             states.step()
@@ -138,17 +140,10 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
                 refine(states)
                 fit_lines(states)
                 let_stand(states, searching=True)
-        elif states.all_free:
-            if mended == _MOST_STEPS or not mend_slips(states):
-                break
-            mended += 1
+        elif mended == _MOST_STEPS or not mend_slips(states):
+            break
         else:
-            states.free_all()
-            for _ in range(4):
-                states.step()
-            if look:
-                prune(states, _PRUNED_EARLY)
-                fit_lines(states)
+            mended += 1
     if look:
         let_stand(states, searching=False)
         for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
@@ -186,7 +181,7 @@ def _result(states: States, false_alarm: float) -> RecordFit:
         errors, np.sqrt(states.variances(0)), _roughness(states), bends, bend_errors,
         states.declared, states.orders, states.tones, states.amplitudes[:, :states.orders.size],
         states.amplitudes[:, states.orders.size:],
-        np.sqrt(variances), states.synchronous | with_a_shaft(states),
+        np.sqrt(variances), states.synchronous,
         float(states.size[0]), states.size[:3] * np.array([weak, 1.0, 1.0]), states.trend,
         bool(gammaincc(shown.size, 0.5 * shown.sum()) < false_alarm))
 
