@@ -67,6 +67,7 @@ class Spectrum:
     """
     A random error: `density` (parameters, frequency) in unit^2 per cycle a trigger cycle.
 
+    Each parameter is a number, or an array that broadcasts with the frequencies.
     `starts` are values of its parameters from which a fit begins, one after the other: the first
     parameter is the logarithm of its power. `lower` and `upper` are bounds; `lower` None stands
     for the lowest frequency that a recording resolves, as a logarithm, and `upper` None for the
@@ -103,14 +104,14 @@ class Pattern:
 
 def white(parameters: Array, frequency: Array) -> Array:
     """Return the density of independent errors: the same at all frequencies."""
-    return np.full(np.shape(frequency), np.exp(parameters[0]))
+    return np.asarray(np.exp(parameters[0]) * np.ones_like(frequency))
 
 
 def autoregressive(parameters: Array, frequency: Array) -> Array:
     """Return the density of first-order autoregressive errors; artanh of their correlation."""
     rho = np.tanh(parameters[1])
     return np.asarray(np.exp(parameters[0]) * (1.0 - rho**2)
-                      / np.abs(1.0 - rho * np.exp(2j * np.pi * frequency)) ** 2)
+                      / ((1.0 - rho) ** 2 + 4.0 * rho * np.sin(np.pi * frequency) ** 2))
 
 
 def low_passed(parameters: Array, frequency: Array) -> Array:
@@ -118,5 +119,5 @@ def low_passed(parameters: Array, frequency: Array) -> Array:
     width, slope = np.exp(parameters[1]), np.exp(parameters[2])
     flat = 0.5 * np.pi / slope
     with np.errstate(divide='ignore'):  # frequency 0
-        above = np.log(np.abs(frequency) / width * (flat / np.sin(flat)))
+        above = np.log(np.abs(frequency)) - parameters[1] + np.log(flat / np.sin(flat))
     return np.asarray(np.exp(parameters[0]) / (2.0 * width) * special.expit(-2.0 * slope * above))

@@ -157,9 +157,13 @@ class States:
         self.wave = np.exp(2j * np.pi * self.cycle_length * self.orders[:, None] * self.u)
         self.reading = np.ascontiguousarray(self.wave.conj().T).view(np.float64).T
         # cosines and sines of the tones side by side (cycle, point, 2 tone)
-        turned = (self.place - self.band.start)[..., None] * (2.0 * np.pi * self.tones)
-        self.in_time = np.stack([np.cos(turned), np.sin(turned)], axis=-1).reshape(
-            *self.place.shape, -1)
+        turned = (self.place - self.band.start)[..., None] * self.tones
+        turned -= np.rint(turned)  # waves of small angles take less time
+        turned *= 2.0 * np.pi
+        waves = np.empty((*turned.shape, 2))
+        np.cos(turned, out=waves[..., 0])
+        np.sin(turned, out=waves[..., 1])
+        self.in_time = waves.reshape(*self.place.shape, -1)
         self.in_time *= self.whole[:, None, None]
         straight = (self.turn.conj().T @ self.turn) * (self.wave.conj() @ self.wave.T)
         mirrored = (self.turn.T @ self.turn) * (self.wave @ self.wave.T)

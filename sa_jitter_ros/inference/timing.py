@@ -47,8 +47,9 @@ from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import BESIDE, Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
-from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, SteadyTorsion, Stretch
-from sa_jitter_ros.inference.timing_fit import JITTER, NOISE, SHAFT, TimingFit
+from sa_jitter_ros.inference.timing_data import (
+    ALIASES, FEWEST, NOISE, SteadyTorsion, Stretch)
+from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel

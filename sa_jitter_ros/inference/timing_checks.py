@@ -166,7 +166,7 @@ def _identifiable(fit: TimingFit, inverse: Array) -> Array:
     """Return which bins (bin,) show more than sidebands, whose shape nobody knows."""
     if SIDEBANDS not in fit.spectra:
         return np.ones(fit.data.size.size, np.bool_)
-    made = fit.density(SIDEBANDS, fit.parameters)[0]
+    made = fit.density(SIDEBANDS, fit.parameters)[0][0]
     return np.asarray(made < 0.5 * fit.floor(SOURCE, inverse))
 
 
@@ -214,7 +214,7 @@ def _drift(choice: Choice, name: str) -> Check:
     few swings nobody can tell a random motion from any other drift.
     """
     fit, data = choice.fit, choice.fit.data
-    made = fit.density(name, fit.parameters)[0]
+    made = fit.density(name, fit.parameters)[0][0]
     power = float(np.average(made, weights=data.size))
     values = data.cycles * power**2 / float(np.average(made**2, weights=data.size))
     return Check(0.0 if values < _FEW_VALUES else 1.0, fit.moves(name),

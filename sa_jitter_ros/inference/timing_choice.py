@@ -283,8 +283,9 @@ class Chooser:
         width = max(1.0 / self.data.longest, 0.5 * float(np.diff(self.data.frequency).max()))
 
         def density(parameters: Array, frequency: Array) -> Array:
-            apart = np.pi * (frequency[..., None] - lines) / width
-            return np.asarray(1.0 / (1.0 + apart**2) @ np.exp(parameters))
+            return np.asarray(sum(
+                np.exp(power) / (1.0 + (np.pi * (frequency - line) / width) ** 2)
+                for power, line in zip(parameters, lines)))
         return density
 
     def fit(self, names: frozenset[str], start: Mapping[str, Array] | None = None, *,

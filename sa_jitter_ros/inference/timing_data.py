@@ -26,10 +26,12 @@ from itertools import pairwise
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import recovered, recovered_shapes
-from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
+from sa_jitter_ros.effects.timing import MOTION, PULSES, ROUNDING, Setting, SOURCE
 
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
 ALIASES = np.array([0, 1, -1])
+#: Power of the noise of the recovery, beside that in each direction.
+NOISE = 'noise'
 #: Share of a series, at either end, over which a `taper` rises or falls.
 TAPER = 0.05
 _BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one
@@ -85,11 +87,13 @@ class TimingData:
     """
     Periodograms of some stretches and what is the same for every model of them.
 
-    `frequency` (bin,) are the middles of bins of `size` ordinates; `alias` (alias, bin) the
-    frequencies that fall on them; `steer` the cross-spectra (alias, bin, 3, 3) of unit errors in
-    each direction; `passed` (bin, 3, 4) is what the recovery makes of them, `noise` (bin, 3, 3)
-    what it adds. `ordinates` (ordinate, 3) are the transforms at the frequencies `each`, and what
-    sets stretches apart between which some cycles are left out.
+    `frequency` (bin,) are the middles of bins of `size` ordinates; `alias` the frequencies (alias,
+    bin) that fall on them, where errors of a direction have any; `steer` the cross-spectra (alias,
+    bin, 3, 3) of unit errors in each direction; `passed` (bin, 3, 4) is what the recovery makes of
+    them, `noise` (bin, 3, 3) what it adds. `table` (row, bin, 3, 3) has noise and `steer` of the
+    measured pulses one after the other, in `rows` by name. `ordinates` (ordinate, 3) are the
+    transforms at the frequencies `each`, and what sets stretches apart between which some cycles
+    are left out.
     """
 
     def __init__(self, stretches: Sequence[Stretch]) -> None:
@@ -111,7 +115,6 @@ class TimingData:
         self.size = np.add.reduceat(weight, edges[:-1])
         self.frequency = np.add.reduceat(weight * frequency, edges[:-1]) / self.size
         self.bin = np.repeat(np.arange(self.size.size), np.diff(edges))
-        self.alias = np.abs(self.frequency + ALIASES[:, None])
         # bends that nothing resolves are no series
         self.series = 3 if any(np.isfinite(item.bend_std) for item in self.stretches) else 2
         passed, noise = self._recovery()
@@ -124,6 +127,14 @@ class TimingData:
                 for n in ALIASES])
             self.steer[name] = outer(passed)
         self.steer[PULSES] = self.steer[PULSES][:1]
+        made = {NOISE: self.noise[None], **self.steer, PULSES: self.measured * self.steer[PULSES]}
+        # of very large motion, rounding alone tells one series from the others
+        self.table = np.concatenate(list(made.values()))
+        self.table *= 1.0 + ROUNDING**1.5 * np.eye(self.series)
+        ends = np.cumsum([0, *map(len, made.values())]).tolist()
+        self.rows = dict(zip(made, map(slice, ends, ends[1:])))
+        self.alias = {name: np.abs(self.frequency + ALIASES[:len(rows), None])
+                      for name, rows in made.items()}
         self.ordinates = self.transform([self._series(item) for item in self.stretches])
 
     @property
@@ -209,11 +220,22 @@ class TimingData:
         return (self.transform([wave.real for wave in waves]),
                 self.transform([wave.imag for wave in waves]))
 
+    def made(self, density: Array, direction: str | None = None) -> Array:
+        """Return the cross-spectrum (bin, 3, 3) of a density (row, bin), of all rows or some."""
+        table = self.table[self.rows[direction]] if direction else self.table
+        found = np.einsum('rf,rfk->fk', density, parts(table))
+        return np.asarray(found.view(np.complex128).reshape(table.shape[1:]))
+
     def binned(self, ordinates: Array) -> Array:
         """Return the mean cross-periodogram (bin, 3, 3) of ordinates."""
         power = outer(ordinates) * self.weight[:, None, None]
         return np.asarray(np.add.reduceat(power, self.edges[:-1], axis=0)
                           / self.size[:, None, None])
+
+
+def parts(matrices: Array) -> Array:
+    """Return all real and imaginary parts of matrices (..., i, j) in one axis."""
+    return matrices.view(np.float64).reshape(*matrices.shape[:-2], -1)
 
 
 def of_measured(item: Stretch, errors: Array) -> Array:

@@ -24,13 +24,13 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.timing import (
-    FAINT, LARGE, MOTION, Pattern, PULSES, ROUNDING, Spectrum, white)
+    FAINT, LARGE, MOTION, Pattern, PULSES, ROUNDING, SOURCE, Spectrum, white)
 from sa_jitter_ros.inference.line_search import APART
-from sa_jitter_ros.inference.timing_data import TimingData
+from sa_jitter_ros.inference.timing_data import NOISE, parts, TimingData
 from scipy.optimize import minimize
 
-#: What is always there: the motion of the shaft, the declared jitter, the noise of the recovery.
-SHAFT, JITTER, NOISE = 'shaft', 'jitter_scale', 'noise'
+#: What is always there beside the noise: the motion of the shaft and the declared jitter.
+SHAFT, JITTER = 'shaft', 'jitter_scale'
 # Frequencies at which the spectrum of the motion is free.
 _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
@@ -50,16 +50,16 @@ class ShaftSpectrum:
         self._beyond = np.maximum(place - knots[-1], 0.0)
         self._motion = (2.0 * np.pi * frequency) ** -4
 
-    def density(self, parameters: Array) -> Array:
-        """Return the density: its logarithm at the knots, and that of the slope beyond them."""
-        level = np.tensordot(parameters[:_KNOTS], self._knots, 1)
-        return np.asarray(self._motion * np.exp(
-            level - np.exp(parameters[_KNOTS]) * self._beyond))
+    def density(self, parameters: Array) -> tuple[Array, Array]:
+        """
+        Return the density, and its slope by each parameter (parameter, ...).
 
-    def slopes(self, parameters: Array, density: Array) -> Array:
-        """Return by how much a `density` grows with each of its parameters (parameter, ...)."""
+        Parameters are its logarithm at the knots, and that of the slope beyond them.
+        """
         steeper = -np.exp(parameters[_KNOTS]) * self._beyond
-        return np.asarray(density * np.concatenate([self._knots, steeper[None]]))
+        level = (parameters[:_KNOTS] @ self._knots.reshape(_KNOTS, -1)).reshape(steeper.shape)
+        density = self._motion * np.exp(level + steeper)
+        return density, density * np.concatenate([self._knots, steeper[None]])
 
 
 class TimingFit:
@@ -68,7 +68,7 @@ class TimingFit:
 
     `spectra` and `patterns` are the components in question by name; JITTER among the names lets
     the declared jitter have any size. `fixed` are directions and densities of declared random
-    errors, `declared_motion` (bin, 3, 3) what those make that are none of the pulses; `known`
+    errors, `declared_motion` (bin, 3, 3) what those of source and shaft make; `known`
     (ordinate, 3) are the declared patterns. `held` maps (name, number) to the value of
     a parameter that stays.
     """
@@ -80,7 +80,7 @@ class TimingFit:
                  held: Mapping[tuple[str, int], float] | None = None) -> None:
         self.data, self.spectra, self.patterns = data, spectra, patterns
         self.free_jitter = scaled or any(item.replaces_jitter for item, _ in patterns.values())
-        self._shaft = ShaftSpectrum(data.alias, APART / data.longest)
+        self._shaft = ShaftSpectrum(data.alias[MOTION], APART / data.longest)
         self.columns, total = {}, 0
         stack = []
         for name, (_, columns) in patterns.items():
@@ -90,23 +90,15 @@ class TimingFit:
         self.matrix = np.concatenate(stack, axis=-1) if stack else np.zeros(
             (*data.ordinates.shape, 0))
         self.ordinates = data.ordinates - known
-        self._fixed = self.declared_motion = data.noise * 0.0
+        self._fixed = np.zeros(data.table.shape[:2])
         for direction, density in fixed:
-            made = self._of(direction, density(data.alias))
-            self._fixed = self._fixed + made
-            if direction != PULSES:
-                self.declared_motion = self.declared_motion + made
+            self._fixed[data.rows[direction]] += density(data.alias[direction])
+        source, motion = (self._fixed[data.rows[moves]] for moves in (SOURCE, MOTION))
+        self.declared_motion = data.made(source, SOURCE) + data.made(motion, MOTION)
         if not self.free_jitter:
-            self._fixed = self._fixed + self._of(PULSES, white(np.zeros(1), data.alias))
-        self._apart = 1.0 + ROUNDING**1.5 * np.eye(data.series)
+            self._fixed[data.rows[PULSES]] += 1.0
         self._lay_out(start or {}, held or {})
         self._maximise()
-
-    def _of(self, direction: str, density: Array) -> Array:
-        steer = self.data.steer[direction]
-        if direction == PULSES:
-            density = density[:1] * self.data.measured
-        return np.asarray(np.einsum('af,afij->fij', density, steer))
 
     def _lay_out(self, start: Mapping[str, Array], held: Mapping[tuple[str, int], float]) -> None:
         """Place all parameters in one vector, with bounds."""
@@ -138,6 +130,13 @@ class TimingFit:
             self.parameters[at] = self.lower[at] = self.upper[at] = value
         self.parameters = np.clip(self.parameters, self.lower, self.upper)
         self._held = len(held)
+        # the prior is normal: residuals are `stiff` times the parameters, less the usual ones
+        self._stiff = np.zeros((_KNOTS, begin))
+        self._stiff[:-2, self.place[SHAFT]][:, :_KNOTS] = np.diff(np.eye(_KNOTS), 2, 0) / _SMOOTH
+        self._stiff[-2, self.place[SHAFT].stop - 1] = 1.0 / _EDGE_SLOPE[1]
+        self._stiff[-1, self.place[NOISE]] = 1.0 / _NOISE_KNOWN
+        self._usual = np.zeros(_KNOTS)
+        self._usual[-2] = _EDGE_SLOPE[0] / _EDGE_SLOPE[1]
 
     def _maximise(self) -> None:
         self.value = -np.inf
@@ -162,82 +161,57 @@ class TimingFit:
         """Return the parameters by name, where another fit may start."""
         return {name: self.parameters[place] for name, place in self.place.items()}
 
-    def density(self, name: str, parameters: Array) -> Array:
-        """Return the power of a random component at each frequency (alias, bin), in unit^2."""
-        values, alias = parameters[self.place[name]], self.data.alias
+    def density(self, name: str, parameters: Array) -> tuple[Array, Array]:
+        """
+        Return the power of a random component (alias, bin) in unit^2, where it has any.
+
+        Its slopes by each of its parameters (parameter, alias, bin) follow.
+        """
+        values, alias = parameters[self.place[name]], self.data.alias[self.moves(name)]
         if name == SHAFT:
             return self._shaft.density(values)
-        if name == JITTER:
-            return white(values, alias)
-        return self.spectra[name].density(values, alias)
+        if name in (JITTER, NOISE):
+            made = white(values, alias)
+            return made, made[None]
+        steps = ROUNDING * np.eye(values.size + 1, values.size, -1)
+        made = self.spectra[name].density((values + steps).T[:, :, None, None], alias)
+        return made[0], (made[1:] - made[0]) / ROUNDING
 
     def moves(self, name: str) -> str:
         """Return the direction of a random component."""
-        return {SHAFT: MOTION, JITTER: PULSES}.get(name) or self.spectra[name].direction
+        return {SHAFT: MOTION, JITTER: PULSES, NOISE: NOISE}.get(
+            name) or self.spectra[name].direction
 
     def contribution(self, name: str) -> Array:
         """Return the cross-spectrum (bin, 3, 3) that a component makes."""
-        return self._of(self.moves(name), self.density(name, self.parameters))
+        return self.data.made(self.density(name, self.parameters)[0], self.moves(name))
+
+    def _densities(self, parameters: Array) -> tuple[Array, Array]:
+        """Return the density (row, bin) of all components, and its slopes (parameter, ...)."""
+        total, slopes = self._fixed.copy(), np.zeros((parameters.size, *self._fixed.shape))
+        for name, place in self.place.items():
+            rows = self.data.rows[self.moves(name)]
+            made, slopes[place, rows] = self.density(name, parameters)
+            total[rows] += made
+        return total, slopes
 
     def spectrum(self, parameters: Array) -> Array:
         """Return what all components make of the three series together (bin, 3, 3)."""
-        total = self._fixed + self.data.noise * np.exp(parameters[self.place[NOISE]][0])
-        for name in self.place:
-            if name != NOISE:
-                total = total + self._of(self.moves(name), self.density(name, parameters))
-        # of very large motion, rounding alone tells one series from the others
-        return np.asarray(total * self._apart)
-
-    def _prior(self, parameters: Array) -> tuple[float, Array]:
-        """Return minus the logarithm of the prior, and its slope."""
-        slope = np.zeros(parameters.size)
-        place = self.place[SHAFT]
-        bend = np.diff(parameters[place][:_KNOTS], 2) / _SMOOTH
-        bends = np.diff(np.eye(_KNOTS), 2, axis=0) / _SMOOTH
-        slope[place.start:place.start + _KNOTS] = bend @ bends
-        steep = (parameters[place][_KNOTS] - _EDGE_SLOPE[0]) / _EDGE_SLOPE[1]
-        slope[place.stop - 1] = steep / _EDGE_SLOPE[1]
-        noise = parameters[self.place[NOISE]][0] / _NOISE_KNOWN
-        slope[self.place[NOISE].start] = noise / _NOISE_KNOWN
-        total = 0.5 * (bend @ bend + steep**2 + noise**2)
-        return float(total), slope
+        return self.data.made(self._densities(parameters)[0])
 
     def _cost(self, parameters: Array) -> tuple[float, Array]:
         """Return minus the logarithm of likelihood and prior, and its slope."""
         data = self.data
-        spectrum = self.spectrum(parameters)
+        density, slopes = self._densities(parameters)
+        spectrum = data.made(density)
         inverse = np.linalg.inv(spectrum)
-        value, slope = self._prior(parameters)
-        value += float(np.sum(data.size * (
-            np.linalg.slogdet(spectrum)[1]
-            + np.einsum('fij,fji->f', inverse, self.power).real)))
+        off = self._stiff @ parameters - self._usual
+        value = 0.5 * off @ off + data.size @ (np.linalg.slogdet(spectrum)[1] + np.sum(
+            parts(inverse) * parts(self.power), axis=1))
         change = data.size[:, None, None] * (inverse - inverse @ self.power @ inverse)
-        along: dict[str, Array] = {}
-        for name, place in self.place.items():
-            if name == NOISE:
-                slope[place] += np.einsum('fij,fji->', change, data.noise).real * np.exp(
-                    parameters[place])
-                continue
-            direction = self.moves(name)
-            if direction not in along:
-                along[direction] = np.einsum('fij,afji->af', change, data.steer[direction]).real
-                if direction == PULSES:
-                    along[direction] = along[direction] * data.measured
-            slopes = self._slopes(name, parameters)
-            if direction == PULSES:
-                slopes = slopes[:, :1]
-            slope[place] += np.einsum('paf,af->p', slopes, along[direction])
-        return value, slope
-
-    def _slopes(self, name: str, parameters: Array) -> Array:
-        """Return the slopes (parameter, alias, bin) of the density of a random component."""
-        place, base = self.place[name], self.density(name, parameters)
-        if name == SHAFT:
-            return self._shaft.slopes(parameters[place], base)
-        if name == JITTER:
-            return base[None]
-        moved = parameters + ROUNDING * np.eye(parameters.size)[place]
-        return np.stack([(self.density(name, row) - base) / ROUNDING for row in moved])
+        along = np.einsum('rfk,fk->rf', parts(data.table), parts(change))
+        slope = off @ self._stiff + slopes.reshape(parameters.size, -1) @ along.ravel()
+        return float(value), slope
 
     def _patterns(self, spectrum: Array) -> tuple[Array, Array, Array]:
         """Return sizes of the patterns, their covariance, and the ordinates without them."""
@@ -285,12 +259,10 @@ class TimingFit:
         at, size = self.parameters, self.data.size
         chosen = np.append(self.place[name].start,
                            np.flatnonzero((self.lower < at) & (at < self.upper)))
-        steps = _CURVED * np.eye(at.size)[chosen]
-        change = np.stack([self.inverse @ (self.spectrum(at + step) - self.spectrum(at - step))
-                           for step in steps]) / (2.0 * _CURVED)
-        prior = np.stack([self._prior(at + step)[1] - self._prior(at - step)[1]
-                          for step in steps]) / (2.0 * _CURVED)
-        known = prior[:, chosen] + np.einsum('f,afij,bfji->ab', size, change, change).real
+        change = np.stack([self.inverse @ self.data.made(slope)
+                           for slope in self._densities(at)[1][chosen]])
+        prior = self._stiff[:, chosen]
+        known = prior.T @ prior + np.einsum('f,afij,bfji->ab', size, change, change).real
         known[1:, 1:] += np.diag(12.0 / (self.upper - self.lower)[chosen[1:]] ** 2)
         share = np.append(1.0, -np.linalg.solve(known[1:, 1:], known[1:, 0]))
         information = float(share @ known[0])
@@ -298,7 +270,7 @@ class TimingFit:
             return 0.0, 0.0
         weight = np.einsum('a,afij->fij', share, change)
         declared = np.einsum('f,fij,fji->', size, weight @ self.inverse,
-                             self.data.steer[PULSES][0]).real * self.data.measured
+                             self.data.table[self.data.rows[PULSES]][0]).real
         if JITTER in self.place:  # more may be of normal errors beside
             power = float(at[self.place[JITTER]][0])
             declared *= math.exp(power if name == JITTER else min(power, 0.0))

@@ -164,14 +164,14 @@ def _pairs(g: Array, processes: Sequence[AngleErrorProcess], mean: Array, u: Arr
     They are (order, lag, place of x, place of y), 0 for lags beyond `reach`.
     """
     found = np.zeros((2, g.size, 4 * reach + 1, u.size, u.size), complex)
+    order, signs = g[:, None, None], np.array([1.0, -1.0])[:, None, None, None]
+    level = mean[:, :, None] * np.stack((mean, mean.conj()))[:, :, None]
     for lag in range(reach + 1):
-        for item, sign, other in zip(found, (1.0, -1.0), (mean, mean.conj())):
-            value = joint_characteristic(
-                processes, [g[:, None, None], sign * g[:, None, None]], [u[:, None], u], [0, lag]
-                ) / (mean[:, :, None] * other[:, None]) - 1.0
-            back = value.transpose(0, 2, 1)
-            item[:, 2 * reach - lag] = back if sign > 0.0 else back.conj()
-            item[:, 2 * reach + lag] = value
+        value = joint_characteristic(
+            processes, [order, signs * order], [u[:, None], u], [0, lag]) / level - 1.0
+        back = value.swapaxes(2, 3)
+        found[:, :, 2 * reach - lag] = np.stack((back[0], back[1].conj()))
+        found[:, :, 2 * reach + lag] = value
     return found[0], found[1]
 
 

@@ -122,24 +122,23 @@ def cycle_moments(orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, 
     """
     g = require_orders(orders)
     u, w = unit_nodes(nodes)
-    plane = g[:, None, None]
+    plane, signs = g[:, None, None], np.array([-1.0, 1.0])[:, None, None, None]
     first = joint_characteristic(processes, [g[:, None]], [u], [0])
     mean = first @ w
-    variance, pseudo = [], []
+    pairs = []
     fine = (u, w, mean)
     rule = unit_nodes(min(nodes, max(_FAR_NODES, nodes // 4)))
     far = (*rule, joint_characteristic(processes, [g[:, None]], [rule[0]], [0]) @ rule[1])
     length = correlation_length(processes)
     for lag in range((length if lags is None else min(lags, length)) + 1):
         u, w, level = fine if lag <= _NEAR else far
-        points = ([u[:, None], u], [0, lag])
-        variance.append(joint_characteristic(processes, [plane, -plane], *points) @ w @ w
-                        - np.abs(level) ** 2)
-        pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - level**2)
+        both = joint_characteristic(processes, [plane, signs * plane], [u[:, None], u], [0, lag])
+        pairs.append(both @ w @ w - np.stack((np.abs(level) ** 2, level**2)))
+    variance, pseudo = np.moveaxis(np.array(pairs), 1, 0)
     spread = g * angle_spread(processes)
     for i in np.flatnonzero(spread > _WIDE):
         variance[0][i] = _mean_square(g[i], spread[i], processes) - np.abs(mean[i]) ** 2
-    return CycleMoments(mean, np.array(variance), np.array(pseudo))
+    return CycleMoments(mean, variance, pseudo)
 
 
 def _mean_square(order: float, spread: float, processes: Sequence[AngleErrorProcess]) -> float:

@@ -298,16 +298,18 @@ def _calibrated(controls: Array) -> Array:
     """
     Return weights (order, draw) of sum 1 that give controls (order, i, draw) the mean 0.
 
-    They are those of the estimator by regression. A control whose mean the draws contradict is
-    rounding and does not count; nor does what is left of a control beside the others, if that is.
+    They are those of the estimator by regression; the controls are overwritten. A control whose
+    mean the draws contradict is rounding and does not count; nor does what is left of a control
+    beside the others, if that is.
     """
     count = controls.shape[-1]
     mean = controls.mean(axis=-1, keepdims=True)
-    off = controls - mean
-    scale = np.sqrt(np.einsum('oid,oid->oi', off, off) / count)[..., None]
+    controls -= mean
+    scale = np.sqrt(np.einsum('oid,oid->oi', controls, controls) / count)[..., None]
     known = np.abs(mean) < _BELIEVED / math.sqrt(count) * scale
     factor = np.where(known, 1.0 / np.where(known, scale, 1.0), 0.0)
-    off = (off * factor).astype(np.float32)
+    off = np.empty(controls.shape, np.float32)
+    np.multiply(controls, factor, out=off, casting='same_kind')
     normal = (off @ off.transpose(0, 2, 1)).astype(float) / count
     inverse = np.linalg.pinv(normal, rcond=_COLLINEAR, hermitian=True)
     slope = (mean * factor).transpose(0, 2, 1) @ inverse
