@@ -42,7 +42,6 @@ __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'Tr
 MissingPulses = Literal['break', 'bridge']
 GeometryMode = Literal['none', 'learn', 'given']
 GEOMETRY_MODES = ('none', 'learn', 'given')
-_NO_TEETH = np.empty(0, np.int64)
 _PIECE = 4096  # pulses judged at once
 _RESTART = 3  # pulses after time ran back that begin a new run
 _WHEEL_TOLERANCE = 0.25  # of the intervals in which the gaps of a wheel are found
@@ -217,7 +216,7 @@ class PulseValidator:
     @property
     def teeth(self) -> npt.NDArray[np.int64]:
         """Return the numbers of the teeth that are there (mark,), as far as they are known."""
-        return _NO_TEETH if self._corrector is None else self._corrector.teeth
+        return np.empty(0, np.int64) if self._corrector is None else self._corrector.teeth
 
     def finish(self) -> PulseCounts:
         """Return the counts at the end of the stream: pulses that still wait are unlocked."""
