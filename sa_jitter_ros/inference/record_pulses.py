@@ -188,7 +188,7 @@ class _Accepted:
         chosen = self.number % step == 0
         there = np.flatnonzero(chosen & self.measured)
         number = self.number // step
-        bridged = np.full(int(number[-1]) + 1 if there.size else 0, np.nan)
+        bridged = np.full(int(number[-1]) + 1 if number.size else 0, np.nan)
         bridged[number[chosen]] = self.times[chosen]
         run = np.cumsum(self.starts_run)[there]
         displaced = np.diff(np.cumsum(chosen & self.displaced)[there])

@@ -45,13 +45,14 @@ class End:
     """
     Where a sequence ended: time (s), level of its last interval, and the scatter of `known`.
 
-    `unsteady`: the speed scattered.
+    `tooth` is that of the last pulse. `unsteady`: the speed scattered.
     """
 
     time: float
     level: float
     scatter: float
     known: int
+    tooth: int
     unsteady: bool = False
 
 

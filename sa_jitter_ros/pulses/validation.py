@@ -220,8 +220,8 @@ class PulseValidator:
 
     def finish(self) -> PulseCounts:
         """Return the counts at the end of the stream: pulses that still wait are unlocked."""
-        counts = self.counts
-        return replace(counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
+        waiting = len(self._held) + self._judge.waiting
+        return replace(self.counts, unlocked=self.counts.unlocked + waiting)
 
     def update(self, times: npt.ArrayLike) -> TriggerPulses:
         """
@@ -237,14 +237,13 @@ class PulseValidator:
                               'give real numbers, (n,)')
         pulses = given.astype(np.float64)
         finite = np.isfinite(pulses)
-        if bad := finite.size - int(np.count_nonzero(finite)):
-            self._non_finite += bad
-            pulses = pulses[finite]
-        pulses -= self._path_delay
+        self._non_finite += int(np.count_nonzero(~finite))
+        pulses = pulses[finite] - self._path_delay
         while pulses.size:
             piece, ahead = pulses[:1 if self._held else _PIECE].tolist(), 0
             if not self._held:
-                ahead = _in_order(self._judge.last, piece)
+                every = [self._judge.last, *piece]  # up to the first that runs back
+                ahead = next((k for k, time in enumerate(piece) if time < every[k]), len(piece))
                 self._judge.take(piece[:ahead])
             if ahead < len(piece):
                 self._take(piece[ahead])
@@ -298,14 +297,6 @@ class PulseValidator:
             self._sink.restart()
             held, self._held = self._held, []
             self._judge.take(held)
-
-
-def _in_order(last: float, times: list[float]) -> int:
-    """Return how many times do not run back, from the `last` one before them on."""
-    every = [last, *times]
-    if every == sorted(every):
-        return len(times)
-    return next(k for k, time in enumerate(times) if time < every[k])
 
 
 def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
