@@ -299,3 +299,19 @@ def test_a_mark_that_comes_off_is_told_and_stops_nothing(rng, mode):
     found = np.append(validator.update(times).times, validator.flush().times)
     assert np.max(np.abs(np.diff(found) * 20.0 - 1.0)) < 2e-3
     assert any('target_geometry: ' in line for line in validator.take_messages())
+
+
+@pytest.mark.parametrize('first', range(13, 50, 3))
+def test_a_gap_among_the_first_revolutions_costs_no_later_pulse(rng, first):
+    """A probe of the first revolutions notes their intervals anew behind it."""
+    edges = np.sort(np.append(np.arange(11) / 11, 1.27 / 11))
+    times = ((np.arange(60)[:, None] + edges) / 20.0).ravel()
+    times = np.delete(times + 1e-5 * rng.standard_normal(720), np.arange(first, first + 12))
+    validator = PulseValidator(
+        pulses_per_revolution=12, target_geometry='given',
+        target_angles=(2.0 * np.pi * (edges - np.arange(12) / 12)).tolist())
+    validator.update(times)
+    validator.flush()
+    counts = validator.finish()
+    assert counts.accepted + counts.unlocked == times.size  # none behind the start
+    assert counts.doubles == 0

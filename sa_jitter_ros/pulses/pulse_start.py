@@ -171,9 +171,11 @@ class PulseStart:
         # The first pulse may have been a stray, which only the pattern shows.
         levels = levels + np.log(lock.widths[marks] / learnt.widths[marks])
         begin = regular_start(levels, max(6.0 * pattern.scatter, _LEAST_REGULAR))
-        time = probe.times[begin - 1] if begin else pulses[lock.first]
+        # Behind a long gap a probe notes intervals anew: the first may not be that of the lock.
+        time, slot = (probe.times[begin - 1], int(marks[begin])) if begin else (
+            pulses[lock.first], lock.slot)
         return self._from_earliest(replace(
-            learnt, first=int(np.searchsorted(pulses, time)), slot=int(marks[begin]),
+            learnt, first=int(np.searchsorted(pulses, time)), slot=slot,
             interval=math.exp(levels[begin])), pulses)
 
     def _repeating(self, lock: Lock, pulses: FloatArray, *, doubtful: bool) -> Lock | None:
