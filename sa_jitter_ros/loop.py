@@ -220,7 +220,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                                 ratio=model.ratio,
                                 pulses_per_revolution=model.pulses_per_revolution,
                                 pulses_per_trigger=model.pulses_per_trigger or None,
-                                missing_teeth=recording.missing_teeth):
+                                **recording.target):
                 faults.append(f'{name}: {doubt}')
             try:
                 observations.append(observe(

@@ -111,6 +111,34 @@ def test_pulses_at_random_are_no_shaft_of_another_speed(rng, count):
         validated(np.sort(rng.uniform(0.0, 10.0, count)), 1)
 
 
+@pytest.mark.parametrize('lost', [False, True])
+@pytest.mark.parametrize('step', [0, 1])
+def test_given_angles_are_taken_from_pulses_unless_all_are_of_one_mark(rng, step, lost):
+    edges = np.array([0.0, 0.03, 0.2, 0.5, 0.8])
+    times = ((np.arange(200)[:, None] + edges) / SPEED).ravel() + 1e-6 * rng.normal(size=1000)
+    times = np.delete(times, [308, 500]) if lost else times
+    target = 2.0 * np.pi * (edges - np.arange(5) / 5)
+    recording = Recording(ArraySource(np.zeros((1, 10))), RATE, pulse_times=times,
+                          pulses_per_revolution=5, target_angles=tuple(target.tolist()))
+    found = record_pulses(recording, replace(
+        MODEL, pulses_per_revolution=5, pulses_per_trigger=step, trigger_speed=SPEED))
+    assert np.isin(found.times, times).all() == (step == 0)
+    assert found.missing.sum() == lost * (1 if step == 0 else 2)
+    interval = np.diff(found.times) / (1 + found.missing) * (5.0 if step else 1.0)
+    assert np.max(np.abs(interval * SPEED - 1.0)) < 1e-3
+
+
+def test_a_wheel_whose_trigger_mark_gives_no_pulse_is_refused_in_one_line():
+    numbers = np.arange(16 * 49)
+    tooth = numbers % 16
+    times = numbers[(tooth != 11) & (tooth < 14)] / 16.0 / SPEED
+    with pytest.raises(RecordingError, match='0 trigger pulses of 637 keyphasor pulses'):
+        record_pulses(
+            Recording(ArraySource(np.zeros((1, 10))), RATE, pulse_times=times,
+                      pulses_per_revolution=16, missing_teeth=2),
+            replace(MODEL, pulses_per_revolution=16, trigger_speed=SPEED))
+
+
 def test_trigger_pulses_of_a_wheel_with_gaps_stay_on_its_teeth():
     """The first pulse is not the index, and a fourth of the teeth is missing."""
     teeth = np.arange(5, 2000)

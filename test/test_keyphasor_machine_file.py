@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 import json
+import re
 from types import SimpleNamespace
 import warnings
 
@@ -32,26 +33,32 @@ from sa_jitter_ros.recordings import ArraySource, read
 RATE = 5120.0
 
 
-def write_rig(path, *, turns, marks=1, missing=0, speed=20.0, torsion=0.0, jitter=2e-6,
-              orders=(1, 5, 8), seed=1):
-    """Write a shaft whose angle swings by `torsion` (rad) twice a turn, and its wheel."""
+def write_rig(path, *, turns, marks=1, missing=0, edges=None, speed=20.0, torsion=0.0,
+              jitter=2e-6, orders=(1, 5, 8), seed=1):
+    """
+    Write a shaft whose angle swings by `torsion` (rad) twice a turn, and its wheel.
+
+    Its marks stand at `edges`, in revolutions, or evenly but for the missing ones.
+    """
     rng = np.random.default_rng(seed)
     fine = np.linspace(0.0, turns / speed + 0.1, int((turns / speed + 0.1) * 20e3))
     angle = 2.0 * np.pi * speed * (fine - 0.02) + torsion * np.sin(4.0 * np.pi * speed * fine)
     time = np.arange(int(fine[-1] * RATE)) / RATE
     turned = np.interp(time, fine, angle)
-    numbers = np.arange(turns * marks + 1)
-    numbers = numbers[numbers % marks < marks - missing]
-    pulses = np.interp(2.0 * np.pi * numbers / marks, angle, fine)
+    edges = np.arange(marks - missing) / marks if edges is None else np.asarray(edges)
+    places = np.append((np.arange(turns)[:, None] + edges).ravel(), turns + edges[0])
+    pulses = np.interp(2.0 * np.pi * places, angle, fine)
     np.savez(path, sample_rate=RATE, pulse_times=pulses + rng.normal(0.0, jitter, pulses.size),
              vibration=[sum(np.cos(g * turned + g) for g in orders)
                         + 0.05 * rng.normal(size=time.size)])
 
 
-def run_all(path, folder, capsys):
+def run_all(path, folder, capsys, change=None):
     """Run the three commands; return the text that the last two print, and the report."""
     machine = str(folder / 'machine.yaml')
     assert check_keyphasor.main([str(path), '--output', str(folder), '--quiet']) == 0
+    if change is not None:
+        change(folder / 'machine.yaml')
     capsys.readouterr()
     assert average.main([str(path), '--params', machine, '--output', str(folder / 'averages'),
                          '--no-figures', '--quiet']) == 0
@@ -76,6 +83,82 @@ def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(tmp_path,
     write_rig(tmp_path / 'rig.npz', turns=48, marks=60, missing=2, torsion=np.radians(3.4))
     text, _ = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
     assert 'averages of 1 recording' in text
+
+
+def from_mark_to_mark(file):
+    """Let trigger cycles of a machine file go from mark to mark, five revolutions an average."""
+    text = file.read_text()
+    marks = int(re.search(r'pulses_per_revolution: (\d+)', text)[1])
+    text, count = re.subn(r'( +)trigger_cycles: \d+', rf'\1trigger_cycles: {5 * marks}\n'
+                          r'\1pulses_per_trigger: 1', text)
+    assert count == 2
+    file.write_text(text)
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('each', [False, True])
+@pytest.mark.parametrize('wheel', ['extra', 'three', 'narrow', 'any', 'nearly even'])
+def test_a_wheel_with_marks_at_any_angles_is_taken(tmp_path, capsys, rng, wheel, each):
+    """The loop takes the given angles from the pulses, and finds no effect that is none."""
+    edges = {
+        'extra': np.sort([*np.arange(12) / 12, (rng.integers(12) + rng.uniform(.15, .45)) / 12]),
+        'three': np.array([0.0, 0.31, 0.62]), 'narrow': np.array([0.0, 0.05, 0.12]),
+        'any': np.append(0.0, np.cumsum(rng.uniform(0.3, 1.7, 7))),
+        'nearly even': (np.arange(8) + rng.uniform(-0.05, 0.05, 8)) / 8}[wheel]
+    if wheel == 'any':
+        edges = edges[:-1] / edges[-1]
+    write_rig(tmp_path / 'rig.npz', turns=120, edges=edges, jitter=2e-5, orders=(1, 5, 8, 24))
+    text, report = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys,
+                           change=from_mark_to_mark if each else None)
+    assert 'averages of 1 recording' in text
+    assert (report['verdict'], report['missing_effects'], report['remarks']) == ('none', [], [])
+    table = np.genfromtxt(tmp_path / 'out/averages/averages.csv', delimiter=',', names=True,
+                          dtype=None, encoding='utf-8')
+    if not each:
+        assert np.max(np.abs(table['raw_amplitude'] - 1.0)) < 0.02
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('each', [False, True])
+def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(tmp_path, capsys, each):
+    """Three times the declared jitter, with the size of what is not declared."""
+    def change(file):
+        if each:
+            from_mark_to_mark(file)
+        text, count = re.subn('jitter_std: .*', 'jitter_std: 4e-5', file.read_text())
+        assert count == 1
+        file.write_text(text)
+
+    write_rig(tmp_path / 'rig.npz', turns=200, edges=[*np.arange(12) / 12, 11.3 / 12],
+              jitter=1.2e-4, orders=(1, 5, 8, 24))
+    _, report = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys, change)
+    effect, = report['missing_effects']
+    size = effect['parameters']['std']
+    assert effect['name'] == 'excess_jitter'
+    assert abs(size['value'] - np.sqrt(1.2e-4**2 - 4e-5**2)) < 4.0 * size['standard_error']
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('wrong', ['reversed', 'of fewer marks'])
+def test_angles_of_another_wheel_are_named_as_the_cause(tmp_path, capsys, rng, wrong):
+    edges = np.append(0.0, np.cumsum(rng.uniform(0.3, 1.7, 9)))
+    edges = edges[:-1] / edges[-1]
+    write_rig(tmp_path / 'rig.npz', turns=60, edges=edges)
+    assert check_keyphasor.main([str(tmp_path / 'rig.npz'), '--output', str(tmp_path),
+                                 '--quiet']) == 0
+    other = np.sort((1.0 - edges) % 1.0) if wrong == 'reversed' else np.delete(edges, 4)
+    angles = 2.0 * np.pi * (other - np.arange(other.size) / other.size)
+    file = tmp_path / 'machine.yaml'
+    text = re.sub('target_angles: .*', f'target_angles: {angles.tolist()}', file.read_text())
+    file.write_text(text.replace('revolution: 9', f'revolution: {other.size}'))
+    capsys.readouterr()
+    for main, declared in ((average.main, '--params'), (close_loop.main, '--declared')):
+        assert main([str(tmp_path / 'rig.npz'), declared, str(file), '--output',
+                     str(tmp_path / 'out'), '--quiet']) == 2
+        said = capsys.readouterr().err
+        assert said.count('\n') == 1
+        assert f'pulses fit no target of {other.size} marks as declared' in said
+        assert 'check_keyphasor finds its marks and their angles' in said
 
 
 @pytest.mark.machines

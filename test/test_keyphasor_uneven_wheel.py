@@ -64,6 +64,19 @@ def test_marks_at_any_angles_are_measured(rng, marks):
     assert min(apart) < 2e-3 * 2.0 * np.pi
 
 
+def test_few_uneven_marks_are_counted_to_the_ends_of_a_long_recording(rng):
+    numbered, found = number_and_patterns(
+        pulses_on(rng, np.array([0.0, 0.31, 0.62]), turns=400, ramp=0.0))
+    assert (found[0].teeth, found[0].present, numbered.strays.size) == (3, 3, 0)
+    assert np.array_equal(np.diff(numbered.numbers), np.ones(1199))
+
+
+def test_teeth_that_one_half_of_a_recording_never_shows_are_missing_there(rng):
+    pulses = pulses_on(rng, np.array([0.0, 0.05, 0.12]), turns=30, ramp=0.0)
+    check = check_keyphasor(Recording(ArraySource(np.zeros((1, 100))), 100.0, pulse_times=pulses))
+    assert check.findings['pulses_per_revolution'].value == 3
+
+
 @pytest.mark.parametrize(('teeth', 'missing'), [(60, 2), (36, 1)])
 def test_missing_teeth_stay_missing_teeth_among_many_strays(rng, teeth, missing):
     edges = np.arange(teeth - missing) / teeth

@@ -769,3 +769,14 @@ def test_angles_of_another_target_are_refused_with_a_warning(bench):
     assert values['pulses_geometry_refused'] == '1'
     assert b.set_parameter('target_angles', [0.05]) == (
         False, 'target_angles has 1 angles for a target of 2 marks: give one for each, in rad')
+
+
+def test_pulses_that_fit_no_revolution_of_the_given_angles_have_their_cause_named(bench):
+    b = bench(pulses_per_revolution=2, pulses_per_trigger=1, target_geometry='given',
+              target_angles=[0.8, -0.8])
+    b.play(Machine(speed=50.0), 1.5)
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'the first 64 pulses fit no target of 2 marks as declared' in text
+    assert 'check_keyphasor finds its marks and their angles' in text
+    assert (values['trigger_cycles'], values['pulses_accepted']) == ('0', '0')

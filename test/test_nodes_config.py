@@ -20,7 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
-from sa_jitter_ros.commands import chain, close_loop, design
+from sa_jitter_ros.commands import chain, check_keyphasor, close_loop, design
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
@@ -36,6 +36,7 @@ from sa_jitter_ros.nodes.tach_detector import TachDetector
 from sa_jitter_ros.parameter_file import read_parameters, shipped
 from sa_jitter_ros.recordings.channel_units import channels_of
 from std_msgs.msg import Float64MultiArray
+from test_keyphasor_machine_file import write_rig
 import yaml
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
@@ -50,10 +51,10 @@ TRUE = {18.0: 0.1, 19.0: 1.0, 20.0: 0.1, 37.0: 0.05, 38.0: 0.5, 39.0: 0.05,
 SECONDS, RATE = 24.0, 12.0  # of machine time; times real time
 
 
-def add(graph, name, **parameters):
-    """Start a node from the machine file, with further parameters."""
+def add(graph, name, machine=MACHINE, **parameters):
+    """Start a node from a machine file, with further parameters."""
     return graph.add(
-        NODES[name], cli_args=['--ros-args', '--params-file', str(MACHINE)],
+        NODES[name], cli_args=['--ros-args', '--params-file', str(machine)],
         parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()])
 
 
@@ -152,6 +153,29 @@ def test_nodes_of_the_machine_file_find_the_truth_of_its_simulator(ros_graph):
     assert messages.decode_residual(residuals[0]).p_value > 1e-3
     assert np.isfinite(messages.decode_average(
         'condition_indicator', indicators[-1]).values).all()
+
+
+@pytest.mark.machines
+def test_nodes_take_the_machine_file_of_a_wheel_with_an_extra_mark(ros_graph, tmp_path):
+    path, declared = tmp_path / 'rig.npz', tmp_path / 'machine.yaml'
+    write_rig(path, turns=100, edges=[*np.arange(12) / 12, 11.3 / 12], jitter=2e-5)
+    assert check_keyphasor.main([str(path), '--output', str(tmp_path), '--quiet']) == 0
+    for name in ('synchronous_averager', 'jitter_predictor', 'residual_analyser'):
+        add(ros_graph, name, declared, **(
+            {'acquisitions': 3} if name == 'residual_analyser' else {}))
+    amplitudes = ros_graph.capture('shaft/order_amplitude', Float64MultiArray)
+    residuals = ros_graph.capture('residual', Float64MultiArray)
+    status = ros_graph.capture('/diagnostics', DiagnosticArray)
+    add(ros_graph, 'recording_player', declared, recording=str(path))
+    assert ros_graph.spin(lambda: residuals)
+    for message in amplitudes:
+        table = messages.decode_average('order_amplitude', message)
+        raw = table.values[..., table.names.index('raw_amplitude')]
+        np.testing.assert_allclose(raw, 1.0, atol=0.02)
+    assert messages.decode_residual(residuals[0]).p_value > 1e-3
+    averager = [item.status[0] for item in status
+                if item.status[0].name == 'synchronous_averager']
+    assert {item.level for item in averager} == {DiagnosticStatus.OK}
 
 
 @pytest.mark.machines

@@ -134,7 +134,7 @@ def test_a_pattern_that_is_another_one_is_refused_with_the_reason(rng):
     assert validator.counts.geometry_refused == 1
     assert len(lines) == 1
     assert lines[0].startswith('target_geometry: the pulses show other marks than those known')
-    assert lines[0].endswith('no angles are subtracted')
+    assert lines[0].endswith('no angles are subtracted; check_keyphasor measures them')
     np.testing.assert_array_equal(found.times, pulses)
 
 
@@ -253,3 +253,65 @@ def test_marks_at_any_given_angles_are_followed_through_strays_and_losses(rng, e
         phase = np.angle(np.exp(2j * np.pi * found.times * SPEED))
         assert np.max(np.abs(phase - np.median(phase))) < 2e-3 * 2.0 * np.pi
         assert validator.counts.accepted >= times.size - 6
+
+
+def dropouts(rng, pulses, count):
+    """Return pulses of which some dozens in a row are lost, in so many places."""
+    kept = np.ones(pulses.size, bool)
+    for first in rng.integers(pulses.size - 60, size=count):
+        kept[first:first + rng.integers(4, 40)] = False
+    return pulses[kept]
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('seed', [0, 7])
+@pytest.mark.parametrize('each', [False, True])
+def test_dropouts_of_a_wheel_with_marks_at_any_angles_cost_no_amplitude(seed, each):
+    """Behind each the index tells which mark comes, not the time that passed."""
+    rng = np.random.default_rng(seed)
+    marks = int(rng.integers(6, 16))
+    edges = np.append(0.0, np.cumsum(rng.uniform(0.3, 1.7, marks)))
+    edges = edges[:-1] / edges[-1]
+    pulses = ((np.arange(200)[:, None] + edges) / 20.0).ravel()
+    pulses = dropouts(rng, pulses + rng.normal(0.0, 1e-5, pulses.size), 6)
+    time = np.arange(50_000) / 5000.0
+    turned = 40.0 * np.pi * time
+    averages = sa.average(
+        sum(np.cos(order * turned) for order in (1, 5, 8))[None], 5000.0, pulses,
+        pulses_per_revolution=marks, pulses_per_trigger=1 if each else None,
+        trigger_cycles=20 * marks if each else 20, orders=[1.0, 5.0, 8.0],
+        maximum_discarded=0.5, target_geometry='given',
+        target_angles=(2.0 * np.pi * (edges - np.arange(marks) / marks)).tolist())
+    assert len(averages) >= 5
+    assert max(np.max(np.abs(np.abs(item.amplitudes) - 1.0)) for item in averages) < 0.02
+
+
+@pytest.mark.parametrize('mode', ['given', 'learn'])
+def test_a_mark_that_comes_off_is_told_and_stops_nothing(rng, mode):
+    marks = 6
+    late = 0.03 * rng.standard_normal(marks)
+    pulses = (np.arange(400)[:, None] + np.arange(marks) / marks + late / (2.0 * np.pi)) / 20.0
+    pulses += 1e-5 * rng.standard_normal(pulses.shape)
+    times = np.concatenate([pulses[:200].ravel(), np.delete(pulses[200:], 3, axis=1).ravel()])
+    validator = PulseValidator(
+        pulses_per_revolution=marks, target_geometry=mode, missing_pulses='bridge',
+        target_angles=late.tolist() if mode == 'given' else ())
+    found = np.append(validator.update(times).times, validator.flush().times)
+    assert np.max(np.abs(np.diff(found) * 20.0 - 1.0)) < 2e-3
+    assert any('target_geometry: ' in line for line in validator.take_messages())
+
+
+@pytest.mark.parametrize('first', range(13, 50, 3))
+def test_a_gap_among_the_first_revolutions_costs_no_later_pulse(rng, first):
+    """A probe of the first revolutions notes their intervals anew behind it."""
+    edges = np.sort(np.append(np.arange(11) / 11, 1.27 / 11))
+    times = ((np.arange(60)[:, None] + edges) / 20.0).ravel()
+    times = np.delete(times + 1e-5 * rng.standard_normal(720), np.arange(first, first + 12))
+    validator = PulseValidator(
+        pulses_per_revolution=12, target_geometry='given',
+        target_angles=(2.0 * np.pi * (edges - np.arange(12) / 12)).tolist())
+    validator.update(times)
+    validator.flush()
+    counts = validator.finish()
+    assert counts.accepted + counts.unlocked == times.size  # none behind the start
+    assert counts.doubles == 0

@@ -13,11 +13,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.pulse_chain import Tridiagonal
 from scipy.linalg import cho_factor, cho_solve
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from collections.abc import Sequence
 import math
 
 import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.arrays import BoolArray, ComplexArray
+from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray
 from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
@@ -38,7 +37,6 @@ from sa_jitter_ros.prediction.influence import common_turn
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_solve
 
-Array = NDArray[np.float64]
 
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 # Errors and bends in parts of the declared jitter, and gains: a first guess of bends and gains,

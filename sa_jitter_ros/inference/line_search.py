@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.arrays import BoolArray, ComplexArray
+from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray
 from sa_jitter_ros.averaging.spectral_lines import (
     FALSE, line_limit, peaks, spectrum, top_between)
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
@@ -33,7 +33,6 @@ from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import fft, next_fast_len
 from scipy.special import gammaincc
 
-Array = NDArray[np.float64]
 
 _MOST_LINES = 60  # undeclared ones
 # A line is not far below the strongest, which may leave images of itself.

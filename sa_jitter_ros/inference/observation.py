@@ -24,11 +24,9 @@ the on-line averager (`averaging/shaft.py`).
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.arrays import BoolArray, ComplexArray, FloatArray
+from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray, FloatArray, IntArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
@@ -81,7 +79,7 @@ class Acquisition:
 
     first: int
     times: FloatArray
-    missing: NDArray[np.int64]
+    missing: IntArray
     bridged: FloatArray
     errors: FloatArray
     standard_errors: FloatArray
@@ -95,7 +93,7 @@ class Acquisition:
     reason: str
 
     @property
-    def number(self) -> NDArray[np.int64]:
+    def number(self) -> IntArray:
         """Return the indices of the measured pulses in `bridged`."""
         return numbered(self.missing)
 
@@ -173,7 +171,7 @@ class Observation:
         return np.array([item.period for item in self.acquisitions])
 
     @property
-    def recording(self) -> NDArray[np.int64]:
+    def recording(self) -> IntArray:
         """Return the number (acquisition,) of the recording of each acquisition."""
         first = np.array([item.first for item in self.acquisitions])
         return np.cumsum(np.diff(first, prepend=first[:1] - 1) <= 0)
@@ -185,7 +183,7 @@ class Observation:
             for item in self.acquisitions
             for clean in [_clean(item.raw_cycles, self.model, self.sources)]))
 
-    def stacked(self, field: str) -> NDArray[Any]:
+    def stacked(self, field: str) -> Array:
         """Return one field of all acquisitions as an array."""
         return np.array([getattr(item, field) for item in self.acquisitions])
 

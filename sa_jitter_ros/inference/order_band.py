@@ -20,12 +20,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.interpolate import CubicSpline
-
-Array = NDArray[np.float64]
 
 #: Lines of a trigger cycle beyond which nothing leaks into it; of the band, where the low pass
 #: ends.

@@ -10,8 +10,8 @@
 
 """The trigger pulses of a recording, numbered over gaps, and those of a reference keyphasor."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
@@ -71,9 +71,7 @@ class RecordPulses:
     @property
     def measured(self) -> BoolArray:
         """Return which of the bridged pulses (m,) were measured."""
-        found = np.zeros(self.bridged.size, np.bool_)
-        found[self.number] = True
-        return found
+        return np.isin(np.arange(self.bridged.size), self.number)
 
     @property
     def index(self) -> IntArray:
@@ -135,17 +133,19 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if measured.size < _FEWEST:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
                              'check that the tach waveform crosses its threshold')
-    pulses, counts = _validated(
-        measured, model.pulses_per_revolution, recording.duration, recording.missing_teeth)
+    pulses, validator = _validated(
+        measured, recording.duration, model.pulses_per_revolution, step, **recording.target)
+    counts, causes = validator.finish(), validator.take_messages()
     spurious = counts.doubles + counts.early
     if spurious > _MOST_SPURIOUS * measured.size:
-        raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
-                             f'{_MOST_SPURIOUS:.0%}: give the trigger more hysteresis')
+        raise RecordingError(
+            f'{spurious} of {measured.size} pulses are spurious, more than {_MOST_SPURIOUS:.0%}: '
+            + (causes or ['give the trigger more hysteresis'])[0])
     dropped = spurious + counts.unlocked
     if dropped > _MOST_DROPPED * measured.size:
-        raise RecordingError(f'{dropped} of {measured.size} pulses follow each other at no '
-                             'interval that a shaft could have: see what check_keyphasor finds in '
-                             'them')
+        raise RecordingError(
+            f'{dropped} of {measured.size} pulses follow each other at no interval that a shaft '
+            'could have: ' + (causes or ['see what check_keyphasor finds in them'])[0])
     found = pulses.every(step)
     if found.times.size < _FEWEST or not np.any(found.missing == 0):
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
@@ -159,7 +159,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     reference, other = None, recording.reference_pulse_times
     itself = other is not None and np.array_equal(measured, other)
     if other is not None and not itself:
-        better, _ = _validated(other, 1, recording.duration)
+        better, _ = _validated(other, recording.duration)
         # one pulse of the reference in each trigger cycle, or as many as there are of the other
         longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
         reference = _matched(found, better.every(1), step if longer**2 < step else 1)
@@ -188,7 +188,7 @@ class _Accepted:
         chosen = self.number % step == 0
         there = np.flatnonzero(chosen & self.measured)
         number = self.number // step
-        bridged = np.full(int(number[-1]) + 1 if there.size else 0, np.nan)
+        bridged = np.full(int(number[-1]) + 1 if number.size else 0, np.nan)
         bridged[number[chosen]] = self.times[chosen]
         run = np.cumsum(self.starts_run)[there]
         displaced = np.diff(np.cumsum(chosen & self.displaced)[there])
@@ -199,17 +199,18 @@ class _Accepted:
             displaced=displaced)
 
 
-def _validated(times: FloatArray, marks: int, longest: float, missing_teeth: int = 0
-               ) -> tuple[_Accepted, PulseCounts]:
+def _validated(times: FloatArray, longest: float, marks: int = 1, step: int = 1, **target: Any
+               ) -> tuple[_Accepted, PulseValidator]:
     """
-    Return the accepted pulses of a target of so many marks, and the counts of all pulses.
+    Return the accepted pulses of a target of so many marks, and what validated all of them.
 
     A gap that is `longest` (s) has no vibration behind it, so that pulses need no number there.
+    Uneven angles of the `target` are taken from the times as in an average, unless every trigger
+    cycle, of `step` pulses, begins at the same mark.
     """
     # Every pulse is a trigger here, so that pulses are counted also where a run is interrupted.
-    validator = PulseValidator(
-        pulses_per_revolution=marks, pulses_per_trigger=1, missing_teeth=missing_teeth,
-        missing_pulses='bridge')
+    validator = PulseValidator(pulses_per_revolution=marks, pulses_per_trigger=1,
+                               missing_pulses='bridge', **target)
     found = TriggerPulses.joined([validator.update(times), validator.flush()])
     number = found.count.copy()
     for begin in np.flatnonzero(np.diff(number) <= 0) + 1:  # after a gap of unknown length
@@ -221,13 +222,32 @@ def _validated(times: FloatArray, marks: int, longest: float, missing_teeth: int
     # before an interruption may be its cause.
     doubtful = found.doubtful | np.append((found.doubtful | found.starts_run)[1:], False)
     doubtful[:-2] |= found.starts_run[2:]
+    came = _as_they_came(times, found, number, validator,
+                         np.array(target.get('target_angles', ())))
     # A pulse that was dropped where one is missing is that one, far from its place by its jitter.
-    dropped = np.setdiff1d(times, found.times[found.measured])
-    displaced = np.zeros(number.size, np.bool_)
-    if number.size:
-        displaced[np.searchsorted(0.5 * (found.times[1:] + found.times[:-1]), dropped)] = True
-    return (_Accepted(found.times, number, found.measured, found.starts_run, doubtful,
-                      displaced & ~found.measured), validator.finish())
+    dropped = np.setdiff1d(times, came[found.measured])
+    displaced = np.isin(np.arange(number.size),
+                        np.searchsorted(0.5 * (came[1:] + came[:-1]), dropped))
+    return (_Accepted(found.times if step % marks else came, number, found.measured,
+                      found.starts_run, doubtful, displaced & ~found.measured), validator)
+
+
+def _as_they_came(times: FloatArray, found: TriggerPulses, number: IntArray,
+                  validator: PulseValidator, angles: FloatArray) -> FloatArray:
+    """
+    Return when the pulses `found` (n,) among `times` came.
+
+    They are given without the `angles` (mark,) in rad by which their marks are late.
+    """
+    if number.size < 2 or not validator.teeth.size:
+        return found.times
+    late = np.zeros(validator.pulses_per_revolution)
+    late[validator.teeth] = late.size / (2.0 * np.pi) * (angles - angles.mean())  # in teeth
+    came = found.times + np.gradient(found.times, number) * np.where(
+        found.mark < 0, 0.0, late[found.mark % late.size])
+    nearest = np.searchsorted(0.5 * (times[1:] + times[:-1]), came[found.measured])
+    came[found.measured] = times[nearest]
+    return came
 
 
 def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArray:
@@ -250,31 +270,26 @@ def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArra
     return matched
 
 
-def _remarks(counts: PulseCounts, total: int, displaced: int) -> Sequence[str]:
+def _remarks(counts: PulseCounts, total: int, displaced: int) -> list[str]:
     """Return what the validation dropped, interpolated or could not use, one sentence each."""
-    found = []
     spurious = counts.doubles + counts.early
-    if spurious:
-        found.append(f'{spurious} of {total} pulses are spurious ({counts.doubles} double, '
-                     f'{counts.early} early): they were dropped, and no acquisition contains a '
-                     'trigger cycle next to them')
-    if displaced:
-        found.append(f'{displaced} of them came where a pulse is missing: they are that pulse, '
-                     'displaced by its jitter, and not lost')
-    if counts.missing_bridged > displaced:
-        found.append(f'{counts.missing_bridged - displaced} pulses are missing between the {total}'
-                     ' that were measured')
-    if counts.late:
-        found.append(f'{counts.late} of {total} pulses are late: the gap before them is not a '
-                     'whole number of intervals, or longer than three missing pulses; no '
-                     'acquisition contains such a gap')
-    if counts.unlocked:
-        found.append(f'{counts.unlocked} of {total} pulses arrived before a steady interval was '
-                     'known: they were dropped')
-    return found
+    lost = counts.missing_bridged - displaced
+    found = (
+        (spurious, f'{spurious} of {total} pulses are spurious ({counts.doubles} double, '
+         f'{counts.early} early): they were dropped, and no acquisition contains a trigger cycle '
+         'next to them'),
+        (displaced, f'{displaced} of them came where a pulse is missing: they are that pulse, '
+         'displaced by its jitter, and not lost'),
+        (lost, f'{lost} pulses are missing between the {total} that were measured'),
+        (counts.late, f'{counts.late} of {total} pulses are late: the gap before them is not a '
+         'whole number of intervals, or longer than three missing pulses; no acquisition contains '
+         'such a gap'),
+        (counts.unlocked, f'{counts.unlocked} of {total} pulses arrived before a steady interval '
+         'was known: they were dropped'))
+    return [text for count, text in found if count > 0]
 
 
-def _tach_rate_remark(recording: Recording, model: DeclaredModel) -> Sequence[str]:
+def _tach_rate_remark(recording: Recording, model: DeclaredModel) -> list[str]:
     """Return a remark if the tach was sampled at another rate than the declared one."""
     rate = recording.tach_rate
     if not rate or abs(model.keyphasor_rate / rate - 1.0) <= SAME_RATE:

@@ -17,13 +17,11 @@ the wrong turn. Around cycles that the lines do not fit, errors are chosen anew,
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.pulse_chain import shortest_path
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import fit_lines
 from scipy.special import gammainccinv
-
-Array = NDArray[np.float64]
 
 # Errors that are tried, in parts of a turn of the highest declared order, to either side; the size
 # of errors, in turns, from which one of some hundreds is half a turn or more.

@@ -24,7 +24,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import IntArray
 from sa_jitter_ros.effects import Effect, EFFECTS, make_effect
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, effects_of, Finding, RARE
@@ -99,7 +99,7 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     return trace_bench(bench, timing, progress=progress)
 
 
-def _indices(observation: Observation) -> NDArray[np.int64]:
+def _indices(observation: Observation) -> IntArray:
     """Return the index of each trigger pulse (acquisition, pulse)."""
     index = observation.pulses.index
     return np.array([index[item.first] + item.number for item in observation.acquisitions])

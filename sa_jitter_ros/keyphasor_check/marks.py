@@ -137,8 +137,8 @@ def number_and_patterns(times: FloatArray) -> tuple[NumberedPulses, list[Marking
     """
     Return pulses (n,) in s numbered on their target, and its patterns, the best first.
 
-    Where a stray or a gap comes in most revolutions, the numbers of teeth may be wrong, and all
-    pulses those of marks that stand unevenly.
+    Where strays and gaps are frequent, the numbers of teeth may be wrong, and all pulses those of
+    marks that stand unevenly.
     """
     numbered = number_pulses(times)
     found = patterns(numbered)
@@ -150,7 +150,7 @@ def number_and_patterns(times: FloatArray) -> tuple[NumberedPulses, list[Marking
     wrong = first.strays.size + first.lost.size
     marks = number_marks(times) if wrong * MOST_MARKS > _OFTEN * times.size else None
     uneven = [item for item in patterns(marks) if item.present > 1] if marks is not None else []
-    if marks is not None and uneven and wrong * uneven[0].teeth > _OFTEN * times.size:
+    if marks is not None and uneven:
         other = fit_pulses(marks, uneven[0].teeth)
         if other.unfit < _BETTER * first.unfit:
             return marks, uneven

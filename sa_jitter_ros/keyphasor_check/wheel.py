@@ -113,7 +113,8 @@ def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Mar
     part = _longest(pulses)
     numbers, places = pulses.numbers[part], pulses.places[part]
     classes = numbers % teeth
-    missing = _missing(*_seen_of(numbers, teeth))
+    seen, span = _seen_of(numbers, teeth)
+    missing = _missing(seen, span) | (seen == 0)
     origin = _index(missing)
     missing = np.roll(missing, -origin)
     late = np.array([np.median(places[classes == (tooth + origin) % teeth])

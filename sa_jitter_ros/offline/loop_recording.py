@@ -18,16 +18,17 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from sa_jitter_ros.errors import DataWarning, one_line, ParameterError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, one_line, SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, row_values
+from sa_jitter_ros.offline.settings import target_of
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.tacholess.recording import Tacholess
 
-_VERSION = 1  # of the files: those of another one are written again
+_VERSION = 2  # of the files: those of another one are written again
 _JOB = 'job.json'  # what a finished folder is of
 
 
@@ -64,13 +65,11 @@ def with_pulses(recording: Recording, params: Path, tacholess: Tacholess | None)
 
 
 def on_target(recording: Recording, params: Path) -> Recording:
-    """Return a recording with the missing teeth that the machine file gives to the averager."""
-    try:
-        averager = read_parameters(params, 'synchronous_averager')
-    except ParameterError:  # a file for jitter_predictor only
-        return recording
-    target = {name: averager[name] for name in ('pulses_per_revolution', 'missing_teeth')
-              if name in averager}
+    """Return a recording with the uneven target that the machine file gives to the averager."""
+    target = target_of(params)
+    angles = tuple(target.pop('target_angles', ()))
+    if target.pop('target_geometry', 'none') == 'given':
+        recording = replace(recording, target_angles=angles)
     return recording if recording.missing_teeth or not target.get('missing_teeth') else replace(
         recording, **target)
 

@@ -217,7 +217,7 @@ class MarkCorrector:
         found = found if self._learns else None
         self._say(f'target_geometry: {reason}, from {time:.6f} s on: '
                   + ('the angles of the marks are learnt anew' if found is not None else
-                     'no angles are subtracted'))
+                     'no angles are subtracted; check_keyphasor measures them'))
         self._use(found, teeth)
 
     # --- passing on ---

@@ -29,7 +29,7 @@ If two pulses explain one tooth equally well, neither is used and the tooth coun
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -107,6 +107,11 @@ class PulseFollower:
         while self._queue and not self.lost and (
                 self._take_regular(final) or self._decide(final)):
             self.lost |= self._model.irregular
+
+    @property
+    def tooth(self) -> int:
+        """Return the number of the tooth of the latest true pulse."""
+        return replace(self._lock, slot=self.slot).tooth
 
     def fits(self, gap: float) -> bool:
         """Whether a pulse at this interval (s) from the last one would be regular."""
@@ -333,7 +338,8 @@ class PulseFollower:
             slots, steps = self._passed(passed)
         # A step of the time may be whole by chance: uneven marks tell which of them comes next.
         long = gap > _LONG * float(self._lock.widths.sum()) * math.exp(model.level)
-        if (not known or long) and (self._probe or not self._lock_is_plain):
+        alike = self._lock.even and bool(np.all(self._lock.widths == 1.0))
+        if (not known or long) and (self._probe or not alike):
             self.lost = True
             return
         if after is not None and abs(after - model.level) > tolerance:
@@ -376,12 +382,6 @@ class PulseFollower:
     def _tolerance(self) -> float:
         """Largest deviation of a regular interval from the last pulse."""
         return max(self._model.tolerance, float(self._lock.believed[self.slot]))
-
-    @property
-    def _lock_is_plain(self) -> bool:
-        """Whether all marks are alike, so that none has to be found again."""
-        lock = self._lock
-        return lock.even and bool(np.all(lock.widths == 1.0))
 
     def _passed(self, mark: int) -> tuple[list[int], int]:
         """Return the next `mark` slots, and the teeth that they span."""

@@ -141,7 +141,7 @@ class PulseJudge:
         self._start.failed = self._start.failed + 1 if soon else 0
         self._end = None if model.irregular else End(
             follower.confirmed, model.level, model.scatter,
-            model.known // 2 if soon else model.known, model.unsteady)
+            model.known // 2 if soon else model.known, follower.tooth, model.unsteady)
         self._confirmed, self._follower = follower.confirmed, None
         self._counter.stop()
 
@@ -154,7 +154,9 @@ class PulseJudge:
             gap = first - end.time
             teeth = [gap / math.exp(level) for level in (end.level, math.log(lock.interval))]
             number = round(teeth[0]) if math.isfinite(teeth[0]) else 0
-            if number and max(abs(item - number) for item in teeth) <= NEAR_WHOLE:
+            # An index tells the tooth, whatever the gap between uneven marks says.
+            fits = lock.even or (end.tooth + number - lock.tooth) % int(lock.steps.sum()) == 0
+            if number and fits and max(abs(item - number) for item in teeth) <= NEAR_WHOLE:
                 passed = number
             known_better = end.known >= max(_KNOWN_WELL, count)
             if known_better or 1.0 / _SAME_SCATTER < scatter / end.scatter < _SAME_SCATTER:

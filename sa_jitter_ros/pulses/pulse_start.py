@@ -38,7 +38,6 @@ _LEAST_REGULAR = 5e-3  # tolerance of the first intervals
 _BELIEVED = 0.45  # unevenness of marks that are not known yet
 _LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
 _ROUGH = 0.06  # scatter that may be that of the speed
-_NO_INTERVALS = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -46,13 +45,14 @@ class End:
     """
     Where a sequence ended: time (s), level of its last interval, and the scatter of `known`.
 
-    `unsteady`: the speed scattered.
+    `tooth` is that of the last pulse. `unsteady`: the speed scattered.
     """
 
     time: float
     level: float
     scatter: float
     known: int
+    tooth: int
     unsteady: bool = False
 
 
@@ -143,7 +143,13 @@ class PulseStart:
         """Take pulses away that are in no sequence."""
         del self._queue[:count]
         self._tried -= count
-        self._verdicts.counts['unlocked'] += count
+        counts, marks = self._verdicts.counts, self._target.marks
+        before, counts['unlocked'] = counts['unlocked'], counts['unlocked'] + count
+        limit = max(EvenTarget.memory, REVOLUTIONS * marks)
+        if before < limit <= counts['unlocked'] and not counts['accepted']:
+            self._verdicts.say(
+                f'the first {limit} pulses fit no target of {marks} marks as declared: is it '
+                'noise, or another target? check_keyphasor finds its marks and their angles')
 
     def _at_known_speed(self, lock: Lock, end: End | None) -> Lock:
         """Return the lock with the interval before, if its own is twice, thrice, ... as long."""
@@ -152,7 +158,7 @@ class PulseStart:
         longer = lock.interval / math.exp(end.level)
         if not (is_multiple(longer - 1.0) and round(longer) <= 1 + self._options.maximum_missing):
             return lock
-        return replace(lock, interval=lock.interval / round(longer), intervals=_NO_INTERVALS)
+        return replace(lock, interval=lock.interval / round(longer), intervals=np.empty(0))
 
     def _rehearsed(self, lock: Lock, pulses: FloatArray) -> Lock:
         """Return the lock with the angles between the marks, which the pulses (n,) show."""
@@ -165,9 +171,11 @@ class PulseStart:
         # The first pulse may have been a stray, which only the pattern shows.
         levels = levels + np.log(lock.widths[marks] / learnt.widths[marks])
         begin = regular_start(levels, max(6.0 * pattern.scatter, _LEAST_REGULAR))
-        time = probe.times[begin - 1] if begin else pulses[lock.first]
+        # Behind a long gap a probe notes intervals anew: the first may not be that of the lock.
+        time, slot = (probe.times[begin - 1], int(marks[begin])) if begin else (
+            pulses[lock.first], lock.slot)
         return self._from_earliest(replace(
-            learnt, first=int(np.searchsorted(pulses, time)), slot=int(marks[begin]),
+            learnt, first=int(np.searchsorted(pulses, time)), slot=slot,
             interval=math.exp(levels[begin])), pulses)
 
     def _repeating(self, lock: Lock, pulses: FloatArray, *, doubtful: bool) -> Lock | None:

@@ -19,12 +19,11 @@ a jump of the angle; the few samples of a glitch are left out.
 
 from dataclasses import dataclass
 import math
-from typing import Any
 import warnings
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.arrays import FloatArray
+from numpy.typing import ArrayLike
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
@@ -286,7 +285,7 @@ class AngleCrossings:
             straight[whole] = self._fitted(index[whole], marks[whole], turned, straight[whole])
         return np.asarray(np.maximum.accumulate(straight))
 
-    def _fitted(self, index: NDArray[Any], marks: FloatArray, turned: FloatArray,
+    def _fitted(self, index: Array, marks: FloatArray, turned: FloatArray,
                 straight: FloatArray) -> FloatArray:
         """Return the times of marks by a parabola through the samples around each."""
         around = index[:, None] + np.arange(-_BEFORE, _AFTER)

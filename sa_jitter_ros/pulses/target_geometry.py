@@ -153,6 +153,8 @@ def turned_by(known: MarkOffsets, measured: MarkOffsets, turns: IntArray
     >>> turned_by(known, measured, np.arange(3))
     (1, '')
     """
+    if known.angles.size != measured.angles.size:  # some came off, or are never seen
+        return 0, 'the pulses show other marks than those known'
     every = [turned(known, int(turn)) for turn in turns]
     angles = np.array([item.angles for item in every])
     variance = measured.standard_errors**2 + np.array([item.standard_errors for item in every])**2
@@ -176,6 +178,8 @@ def turned(geometry: MarkOffsets, turn: int) -> MarkOffsets:
 
 def matches(known: MarkOffsets, measured: MarkOffsets, turn: int = 0) -> bool:
     """Return whether the measured angles are the known ones, turned by so many marks."""
+    if known.angles.size != measured.angles.size:
+        return False
     known = turned(known, turn)
     variance = (measured.standard_errors**2 + known.standard_errors**2
                 + _ALIKE**2 * np.mean(known.angles**2))

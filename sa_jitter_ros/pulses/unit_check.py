@@ -12,10 +12,9 @@
 
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array
 
 _FEWEST = 3  # pulses that tell a unit
 _MUCH = 10.0  # pulses that span so many times the vibration are in another unit
@@ -33,7 +32,7 @@ _EPOCH = 1e8  # s; later first pulses are counted since 1970
 _WAVEFORM, _FALLING, _STAYING, _DENSE = 16, 0.25, 0.5, 0.25
 
 
-def is_waveform(times: NDArray[Any], samples: int) -> bool:
+def is_waveform(times: Array, samples: int) -> bool:
     """
     Return whether pulse times beside so many samples of vibration are a sampled tach signal.
 
@@ -66,7 +65,7 @@ class Mistake:
     probability: float = 1.0
 
 
-def likely_mistake(pulses: NDArray[Any], start: float, end: float, rate: float) -> str:
+def likely_mistake(pulses: Array, start: float, end: float, rate: float) -> str:
     """
     Return what is probably wrong with pulse times that do not fit the vibration, '' if they fit.
 
@@ -79,7 +78,7 @@ def likely_mistake(pulses: NDArray[Any], start: float, end: float, rate: float) 
     return found[0].text if found else ''
 
 
-def other_rate(pulses: NDArray[Any], start: float, end: float, rate: float) -> str:
+def other_rate(pulses: Array, start: float, end: float, rate: float) -> str:
     """
     Return that the vibration may have half or twice the rate (Hz), '' if its length is another.
 
@@ -95,7 +94,7 @@ def other_rate(pulses: NDArray[Any], start: float, end: float, rate: float) -> s
             f'rate: is it sampled at {factor * rate:.10g} Hz?')
 
 
-def rate_factor(pulses: NDArray[Any], start: float, end: float) -> float:
+def rate_factor(pulses: Array, start: float, end: float) -> float:
     """Return 2.0 or 0.5 where the vibration is as long as the pulses with that much more rate."""
     times = pulses[np.isfinite(pulses)]
     if times.size < _FEW_REVOLUTIONS:
@@ -106,7 +105,7 @@ def rate_factor(pulses: NDArray[Any], start: float, end: float) -> float:
         factor * (span + 0.5 * room) - (end - start)) < factor * (room + _SAME_SPAN * span)), 1.0)
 
 
-def other_span(pulses: NDArray[Any], start: float, end: float) -> str:
+def other_span(pulses: Array, start: float, end: float) -> str:
     """
     Return that pulses (n,) and vibration have most of the time not in common, '' if they have.
 
@@ -121,12 +120,12 @@ def other_span(pulses: NDArray[Any], start: float, end: float) -> str:
             'sampling rates')
 
 
-def _spans(pulses: NDArray[Any], duration: float) -> str:
+def _spans(pulses: Array, duration: float) -> str:
     times = pulses[np.isfinite(pulses)]
     return f'the pulses span {np.ptp(times):.6g} s, the vibration spans {duration:.6g} s'
 
 
-def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
+def find_mistakes(pulses: Array, start: float, end: float, rate: float
                   ) -> tuple[Mistake, ...]:
     """
     Return what may be wrong with pulse times (n,) that do not fit the vibration, likeliest first.

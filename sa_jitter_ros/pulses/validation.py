@@ -42,7 +42,6 @@ __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'Tr
 MissingPulses = Literal['break', 'bridge']
 GeometryMode = Literal['none', 'learn', 'given']
 GEOMETRY_MODES = ('none', 'learn', 'given')
-_NO_TEETH = np.empty(0, np.int64)
 _PIECE = 4096  # pulses judged at once
 _RESTART = 3  # pulses after time ran back that begin a new run
 _WHEEL_TOLERANCE = 0.25  # of the intervals in which the gaps of a wheel are found
@@ -217,12 +216,12 @@ class PulseValidator:
     @property
     def teeth(self) -> npt.NDArray[np.int64]:
         """Return the numbers of the teeth that are there (mark,), as far as they are known."""
-        return _NO_TEETH if self._corrector is None else self._corrector.teeth
+        return np.empty(0, np.int64) if self._corrector is None else self._corrector.teeth
 
     def finish(self) -> PulseCounts:
         """Return the counts at the end of the stream: pulses that still wait are unlocked."""
-        counts = self.counts
-        return replace(counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
+        waiting = len(self._held) + self._judge.waiting
+        return replace(self.counts, unlocked=self.counts.unlocked + waiting)
 
     def update(self, times: npt.ArrayLike) -> TriggerPulses:
         """
@@ -238,14 +237,13 @@ class PulseValidator:
                               'give real numbers, (n,)')
         pulses = given.astype(np.float64)
         finite = np.isfinite(pulses)
-        if bad := finite.size - int(np.count_nonzero(finite)):
-            self._non_finite += bad
-            pulses = pulses[finite]
-        pulses -= self._path_delay
+        self._non_finite += int(np.count_nonzero(~finite))
+        pulses = pulses[finite] - self._path_delay
         while pulses.size:
             piece, ahead = pulses[:1 if self._held else _PIECE].tolist(), 0
             if not self._held:
-                ahead = _in_order(self._judge.last, piece)
+                every = [self._judge.last, *piece]  # up to the first that runs back
+                ahead = next((k for k, time in enumerate(piece) if time < every[k]), len(piece))
                 self._judge.take(piece[:ahead])
             if ahead < len(piece):
                 self._take(piece[ahead])
@@ -299,14 +297,6 @@ class PulseValidator:
             self._sink.restart()
             held, self._held = self._held, []
             self._judge.take(held)
-
-
-def _in_order(last: float, times: list[float]) -> int:
-    """Return how many times do not run back, from the `last` one before them on."""
-    every = [last, *times]
-    if every == sorted(every):
-        return len(times)
-    return next(k for k, time in enumerate(times) if time < every[k])
 
 
 def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int

@@ -19,8 +19,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.arrays import FloatArray
+from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import ParameterError, RecordingError, SignalError
 from sa_jitter_ros.pulses.sampled_angle import counter_pulses
 from sa_jitter_ros.recordings.recording import ArraySource, MAX_PULSES, Recording
@@ -29,7 +28,7 @@ _MAX_SAMPLE_BYTES = 1 << 40
 _MAX_PULSE_BYTES = 8 * MAX_PULSES
 MAX_FIELD_BYTES = 1 << 20
 
-RawArray = NDArray[Any]
+RawArray = Array
 #: Returns the array under a key of a file, of at most so many bytes.
 Load = Callable[[str, int], RawArray]
 #: The names of the arrays of a file, and what loads one.

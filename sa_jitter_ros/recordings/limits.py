@@ -60,9 +60,7 @@ def check_times(name: str, times: float | FloatArray, error: type[SaJitterError]
 
 def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
     """Raise `error` for finite samples beyond the limit; NaN and infinity are a gap."""
-    if not samples.size:
-        return
-    peak = max(float(samples.max()), -float(samples.min()))
+    peak = max(float(samples.max(initial=0.0)), -float(samples.min(initial=0.0)))
     if peak <= _MAX_SAMPLE:
         return
     wrong = samples[np.isfinite(samples) & (np.abs(samples) > _MAX_SAMPLE)]  # NaN has no order

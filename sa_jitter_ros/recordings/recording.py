@@ -128,6 +128,9 @@ class Recording:
         Pulses of a trigger cycle; None where the file does not say.
     missing_teeth
         Of the target; `pulses_per_revolution` counts them, too.
+    target_angles
+        How late each mark of the target is, rad, those of missing teeth left out; empty for even
+        marks.
     ratio
         Speed of the shaft of interest over the speed of the tach shaft.
     orders
@@ -175,6 +178,7 @@ class Recording:
     pulses_per_revolution: int = 1
     pulses_per_trigger: int | None = None
     missing_teeth: int = 0
+    target_angles: tuple[float, ...] = ()
     ratio: float = 1.0
     orders: tuple[float, ...] = ()
     reference_pulse_times: FloatArray | None = None
@@ -218,14 +222,12 @@ class Recording:
         for name in ('pulse_times', 'reference_pulse_times'):
             _check_pulse_times(name, getattr(self, name))
         names = self.channel_names or tuple(f'channel {k}' for k in range(channels))
-        units = self.units or ('',)
-        units = units * channels if len(units) == 1 else units
+        units = self.units if len(self.units) > 1 else (self.units or ('',)) * channels
         for name, labels in (('channel_names', names), ('units', units)):
             if len(labels) != channels:
                 raise RecordingError(
                     f'{len(labels)} {name} for {channels} channels: give one per channel')
-        object.__setattr__(self, 'channel_names', names)
-        object.__setattr__(self, 'units', units)
+            object.__setattr__(self, name, labels)
 
     def __repr__(self) -> str:
         """Return one line: where it is from, what it holds."""
@@ -253,6 +255,12 @@ class Recording:
     def duration(self) -> float:
         """Return the length of the vibration in s."""
         return self.samples / self.sample_rate
+
+    @property
+    def target(self) -> dict[str, Any]:
+        """Return what is known of the target's marks, as options of `PulseValidator`."""
+        return {'missing_teeth': self.missing_teeth, 'target_angles': self.target_angles,
+                'target_geometry': 'given' if self.target_angles else 'none'}
 
     def blocks(self, samples_per_block: int = 65_536) -> Iterator[FloatArray]:
         """
@@ -304,8 +312,8 @@ class Recording:
         for block in self.tach_blocks():
             if index >= count:
                 return
-            yield SampleBlock(block[:, :count - index], self.start_time + index / rate, rate,
-                              index)
+            start = self.start_time + index / rate
+            yield SampleBlock(block[:, :count - index], start, rate, index)
             index += block.shape[1]
 
     def _checked(self, source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:

@@ -58,7 +58,7 @@ class Tacholess:
                 f'found in the vibration')), None
         return replace(
             recording, pulse_times=found.times, tach=None, tach_rate=None,
-            pulses_per_revolution=1, pulses_per_trigger=None, missing_teeth=0,
+            pulses_per_revolution=1, pulses_per_trigger=None, missing_teeth=0, target_angles=(),
             reference_pulse_times=None, remarks=(*recording.remarks, summary(found))), found
 
 
