@@ -37,7 +37,6 @@ from sa_jitter_ros.prediction.influence import common_turn
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_solve
 
-
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 # Errors and bends in parts of the declared jitter, and gains: a first guess of bends and gains,
 # and the least that all keep always: a bend of nothing would be certain.

@@ -33,7 +33,6 @@ from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import fft, next_fast_len
 from scipy.special import gammaincc
 
-
 _MOST_LINES = 60  # undeclared ones
 # A line is not far below the strongest, which may leave images of itself.
 _SHARE = 0.3

@@ -21,8 +21,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.arrays import BoolArray, ComplexArray
+from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray
 from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
@@ -31,7 +30,6 @@ from sa_jitter_ros.inference.line_search import (
 from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
-
 
 # Steps before lines are looked for, which have to leave them no bends, and those that a search may
 # take; what its last one may change, in standard errors.
