@@ -219,7 +219,7 @@ def nearest_orders(lines: Array, declared: Array) -> tuple[NDArray[np.intp], Arr
     return near, apart[np.arange(near.size), near]
 
 
-def _synchronous(states: States) -> tuple[BoolArray, BoolArray]:
+def _synchronous(states: States, ways: tuple[Array, Array, Array]) -> tuple[BoolArray, BoolArray]:
     """
     Tell which orders, and tones after them (line,), turn with the shafts, and which may.
 
@@ -244,7 +244,7 @@ def _synchronous(states: States) -> tuple[BoolArray, BoolArray]:
         if len(sides) >= _FEWEST_SIDES:
             known |= np.any(np.abs(np.abs(apart) - size) < least, axis=1)
             known |= np.abs(others - size) < least
-    over_angle, over_time, _ = _both_ways(states)
+    over_angle, over_time, _ = ways
     none = np.zeros(states.tones.size, np.bool_)
     sharper = np.append(over_angle > (1.0 + _MISSED) * over_time + ODDS, none)
     stands = np.append(over_time > over_angle + ODDS, ~none)
@@ -257,20 +257,22 @@ def _synchronous(states: States) -> tuple[BoolArray, BoolArray]:
     return synchronous, movable
 
 
-def fit_lines(states: States) -> None:
-    """Fit the amplitudes of all lines, and tell which of them turn."""
+def fit_lines(states: States) -> tuple[Array, Array, Array]:
+    """Fit the amplitudes of all lines, and tell which of them turn; return `both_ways`."""
     states.fit_amplitudes()
-    states.synchronous, states.movable = _synchronous(states)
+    ways = both_ways(states)
+    states.synchronous, states.movable = _synchronous(states, ways)
+    return ways
 
 
-def let_stand(states: States, *, searching: bool) -> None:
+def let_stand(states: States, ways: tuple[Array, Array, Array], *, searching: bool) -> None:
     """
-    Make tones of the undeclared orders that show better over time than over angle.
+    Make tones of the undeclared orders that are better over time than over angle, by `both_ways`.
 
     Parts of a tone are taken out. While others are looked for, when `searching`, it takes one
     that is new and certain.
     """
-    over_angle, over_time, tones = _both_ways(states)
+    over_angle, over_time, tones = ways
     standing = over_time > over_angle + searching * ODDS
     standing &= ~states.synchronous[states.declared:states.orders.size]
     apart, new = APART / float(np.ptp(states.place)), states.tones
@@ -287,7 +289,7 @@ def let_stand(states: States, *, searching: bool) -> None:
     states.step()
 
 
-def _both_ways(states: States) -> tuple[Array, Array, Array]:
+def both_ways(states: States) -> tuple[Array, Array, Array]:
     """
     Return the gain in log likelihood of undeclared orders, of tones near them, and these.
 

@@ -26,7 +26,7 @@ from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
-    add_lines, fit_lines, follow_trend, let_stand, new_lines, prune, refine)
+    add_lines, both_ways, fit_lines, follow_trend, let_stand, new_lines, prune, refine)
 from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
@@ -135,14 +135,13 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
             fit_lines(states)
             if look:
                 refine(states)
-                fit_lines(states)
-                let_stand(states, searching=True)
+                let_stand(states, fit_lines(states), searching=True)
         elif mended == _MOST_STEPS or not mend_slips(states):
             break
         else:
             mended += 1
     if look:
-        let_stand(states, searching=False)
+        let_stand(states, both_ways(states), searching=False)
         for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
             moved = refine(states)
             fit_lines(states)
