@@ -69,6 +69,42 @@ def z_scores(recovery, errors):
 MESH = {19: [1.0], 38: [0.5]}
 
 
+def test_dense_harmonics_show_the_errors(rng):
+    """Impacts make every harmonic as strong as those around it, which are no background."""
+    lines = {order: [np.exp(rng.normal(0.0, 0.5) + 1j * rng.uniform(0.0, 2.0 * np.pi))]
+             for order in range(1, 41)}
+    errors = 5e-5 * rng.standard_normal(61)
+    cycles, pulses = simulate(rng, errors, lines, samples=512, ratio=1.0, noise=0.1)
+    for listed, left in ((), 0.5), ((5.0, 20.0), 0.5), (range(1, 41), 0.05):
+        found = recover(cycles, pulses, declared=5e-5, ratio=1.0, additional_orders=listed)
+        assert found.accepted
+        assert found.std == pytest.approx(np.std(errors), rel=0.15)
+        assert np.std(found.expected - errors) < left * np.std(errors)
+    assert np.mean(z_scores(found, errors) ** 2) == pytest.approx(1.0, abs=0.5)
+
+
+@pytest.mark.parametrize('seed', range(12))
+def test_few_samples_and_parts_of_a_revolution_are_enough(seed):
+    """Orders leak into each other where a cycle is part of a revolution, with 11 to 60 samples."""
+    rng = np.random.default_rng(seed)
+    ratio = 1.0 / rng.integers(1, 12) if seed % 2 else rng.uniform(0.1, 2.5)
+    samples, count = int(np.exp(rng.uniform(np.log(11), np.log(60)))), 80
+    highest = 0.3 * samples / ratio
+    orders = np.unique(np.rint(np.exp(rng.uniform(0.0, np.log(highest), rng.integers(2, 6)))))
+    lines = {order: [np.exp(rng.normal(0.0, 0.5))] for order in orders.tolist()}
+    size = rng.uniform(0.02, 0.07) / orders.max()  # fundamental cycles
+    errors = np.clip(size, 0.0, 0.02 * ratio) * PERIOD / ratio * rng.standard_normal(count + 1)
+    cycles, pulses = simulate(rng, errors, lines, samples=samples, ratio=ratio, noise=0.03)
+    found = recover(cycles, pulses, declared=np.std(errors) * np.exp(rng.normal(0.0, 0.4)),
+                    ratio=ratio, additional_orders=orders)
+
+    assert found.accepted, found.reason
+    assert found.std == pytest.approx(np.std(errors), rel=0.35)
+    late = found.errors - errors
+    late -= np.average(late, weights=found.standard_errors**-2)
+    assert np.mean((late / found.standard_errors) ** 2) < 1.7
+
+
 @pytest.mark.parametrize(('width', 'snr_db'), [(0.2, 10), (0.4, 10), (0.4, 0), (0.8, 10)])
 def test_gear_mesh_is_restored_at_the_widths_that_hide_it(rng, width, snr_db):
     errors = jitter(rng, width)

@@ -96,15 +96,18 @@ class CompressedCycles:
     """
     Trigger cycles as coefficients in an orthonormal basis around their orders.
 
-    `coefficients` (cycle, dimension, channel); `blocks` (order,) is the first dimension that was
-    added for an order. The real part of `mixing[i]` (dimension, node) times the complex values of
-    order i at its `nodes[i]` are coefficients; `start` (cycle, order) are the angles of the orders
-    at the start of the cycles of `grid`, in turns.
+    `coefficients` (cycle, dimension, channel); `blocks` (block,) is the first dimension of those
+    with one level of noise, `block_of` (order,) the block of an order: each has its own unless
+    the samples of a cycle are too few to keep them apart. The real part of `mixing[i]`
+    (dimension, node) times the complex values of order i at its `nodes[i]` are coefficients;
+    `start` (cycle, order) are the angles of the orders at the start of the cycles of `grid`, in
+    turns.
     """
 
     coefficients: FloatArray
     orders: FloatArray
     blocks: NDArray[np.intp]
+    block_of: NDArray[np.intp]
     nodes: tuple[FloatArray, ...]
     mixing: tuple[ComplexArray, ...]
     start: FloatArray
@@ -112,7 +115,7 @@ class CompressedCycles:
 
     @property
     def sizes(self) -> NDArray[np.intp]:
-        """Return the number of dimensions of each order."""
+        """Return the number of dimensions of each block."""
         return np.diff(np.append(self.blocks, self.coefficients.shape[1]))
 
     def response(self, errors: FloatArray, chosen: Sequence[int] | NDArray[np.intp], *,
@@ -179,8 +182,12 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
                    for end, w in zip(ends, widths))
     coefficients = inside.reshape(-1, count, channels)
     start = np.multiply.outer(first_angle + cycle_length * grid.numbers, orders) % 1.0
+    block_of = np.arange(len(orders))
+    if ends[-1] > len(coefficients):
+        block_of = np.zeros_like(block_of)
     return CompressedCycles(np.ascontiguousarray(coefficients.transpose(1, 0, 2)), orders,
-                            ends - 2 * widths, tuple(nodes), mixing, start, grid)
+                            (ends - 2 * widths)[:block_of[-1] + 1], block_of, tuple(nodes), mixing,
+                            start, grid)
 
 
 def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -252,13 +259,18 @@ class PulseErrorFit:
     weight: FloatArray
     precision: Tridiagonal
 
+    @property
+    def informative(self) -> NDArray[np.bool_]:
+        """Return which orders (order,) the errors were fitted to."""
+        return np.asarray(np.isfinite(self.aligned).any(axis=1))
+
 
 @dataclass(frozen=True)
 class PulseErrorProblem:
     """
     Fit of the `chosen` orders of `model`; all others count as noise.
 
-    An order is used only in the channels where it is `significant` (order, channel).
+    The errors are fitted to an order in the channels where it is `significant` (order, channel).
     """
 
     model: CompressedCycles
@@ -277,7 +289,7 @@ class PulseErrorProblem:
         """
         model, orders = self.model, self.model.orders[self.chosen]
         channels, begins = model.coefficients.shape[2], model.grid.begins
-        share = np.zeros((len(model.orders), channels))
+        share = np.zeros((len(model.blocks), channels))
         covariance, std, shown = np.zeros((2, model.grid.pulses)), declared, 0.0
         amplitudes = np.zeros((len(orders), channels), np.complex128)
         for number in range(_ITERATIONS):
@@ -320,7 +332,7 @@ class PulseErrorProblem:
         alone = information.plus(_SINGULAR * (float(information.diagonal.max()) + std**-2))
         unshrunk = errors - step + alone.solve(pull)
         unit = np.mean(np.sum(response.signal[:, :, :len(orders)] ** 2, axis=1), axis=0)
-        noise = np.sqrt(2.0 * variance[self.chosen] / unit[:, None])
+        noise = np.sqrt(2.0 * variance[model.block_of[self.chosen]] / unit[:, None])
         plain = np.abs(least_squares(response.signal, response.signal, model.coefficients))
         size = np.abs(amplitudes)
         aligned = np.divide(plain, size, out=np.full(plain.shape, np.nan),
@@ -346,7 +358,8 @@ class PulseErrorProblem:
         variance = self._variance(rest, np.zeros(1), 0.0)
         weighted = model.coefficients / np.repeat(variance, model.sizes, axis=0)
         reach = _SCAN_REACH * width
-        steps = int(np.ceil(reach * model.orders[self.chosen].max() * _SCAN_POINTS))
+        highest = model.orders[self.chosen][self.significant.any(axis=1)].max()
+        steps = int(np.ceil(reach * highest * _SCAN_POINTS))
         levels = np.linspace(-0.5, 0.5, steps + 1) * reach
         start, end = (item.ravel() for item in np.meshgrid(levels, levels, indexing='ij'))
         score = np.zeros((len(start), count))
@@ -362,15 +375,16 @@ class PulseErrorProblem:
 
     def _variance(self, residual: FloatArray, share: FloatArray, shown: float) -> FloatArray:
         """
-        Return the noise variance of one dimension (order, channel), from the median over cycles.
+        Return the noise variance of one dimension (block, channel), from the median over cycles.
 
-        `share` is the fraction of the information that an order and channel has; the fit of the
+        `share` is the fraction of the information that a block and channel has; the fit of the
         errors removes this fraction of one dimension per cycle from its residual, or the share
         `shown` of it that the vibration shows of the errors.
         """
         count, size = len(residual), self.model.sizes[:, None]
         power = np.median(np.add.reduceat(residual**2, self.model.blocks, axis=1), axis=0)
-        free = size - share * shown - 2.0 / count
+        orders = np.bincount(self.model.block_of)[:, None]
+        free = size - share * shown - 2.0 * orders / count
         variance = power / free / (1.0 - 2.0 / (9.0 * free)) ** 3  # median of chi-squared
         # Resampling and model are not exact.
         fitted = self.model.coefficients - residual

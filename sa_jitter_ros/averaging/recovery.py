@@ -58,6 +58,7 @@ _AMBIGUOUS = 1.0
 # Amplitudes below this fraction of the RMS of a channel are rounding errors.
 _ROUNDING = 1e-9
 _STAGES = 8
+_MOST_COLUMNS = 400  # of the compression, which takes most of the time
 # Fewer cycles than this do not separate an order from that of another shaft near it; then errors
 # of this many declared standard deviations are refused.
 _FEW_CYCLES, _FAR = 10, 6.0
@@ -185,7 +186,7 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     beside_lines = (Alignment(fit.aligned, np.zeros(fit.aligned.shape), 0.0, 0.0) if reason
                     else alignment(problem, fit))
     # of the orders that determine the errors, each with its weight
-    power = np.sum(np.abs(fit.amplitudes / fit.noise) ** 2, axis=1)
+    power = np.sum(np.abs(fit.amplitudes / fit.noise) ** 2, axis=1) * fit.informative
     order = np.sqrt(np.sum(fit.orders**4 * power) / np.sum(fit.orders**2 * power))
     return PulseErrorRecovery(
         errors, fit.standard_errors * seconds, not reason, reason, expected, fit.covariance,
@@ -208,7 +209,7 @@ def _likeliest(attempt: Callable[..., _Attempt], declared: float) -> _Attempt:
 
 def _may_be_aside(fit: PulseErrorFit, declared: float) -> bool:
     """Return whether errors are larger than declared and turn an order that was used too far."""
-    turns = _UNIFORM_WIDTH * fit.std * float(fit.orders.max())
+    turns = _UNIFORM_WIDTH * fit.std * float(fit.orders[fit.informative].max())
     return fit.std > _SUSPICIOUS * declared and turns > _LARGE_TURNS
 
 
@@ -252,51 +253,63 @@ def _refusal(fit: PulseErrorFit, errors: FloatArray, turned: NDArray[np.bool_], 
     return ''
 
 
+def _whole(cycles: FloatArray) -> bool:
+    """Return whether orders have whole `cycles` in a trigger cycle, and do not leak there."""
+    return bool(np.all(np.abs(cycles - np.rint(cycles)) < _ROUNDING))
+
+
 def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                 orders: Sequence[float], additional_orders: Sequence[float], most_orders: int,
                 declared: float, expected: float) -> _Attempt:
     """
     Fit low orders first, then higher ones as the errors become better known.
 
+    Where orders leak into each other in a trigger cycle, those that are listed or significant are
+    fitted even if they tell nothing of the errors, which would follow what they leak.
+
     `declared` is the standard deviation of the errors that is likeliest beforehand, `expected`
     the one whose turns of the orders decide which are safe to use.
     """
-    samples = grid.samples
-    given = np.unique([g for g in orders if 0.0 < g * cycle_length <= 0.5 * len(samples)])
+    listed = np.unique([g for g in (orders if len(orders) else additional_orders)
+                        if 0.0 < g * cycle_length <= 0.5 * len(grid.samples)])
     search = None if len(orders) else LineSearch.of(grid, cycle_length, additional_orders)
     most = most_orders + sum(g != round(g) for g in set(additional_orders))
     rounding = _ROUNDING * grid.size
-    known = given if search is None else search.orders
+    known = listed if search is None else search.orders
     width = _UNIFORM_WIDTH * expected  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
     errors, used, clear = np.zeros(grid.pulses), np.empty(0), np.empty(0)
     problem = None
     for _ in range(_STAGES):
         reach = _MOST_TURNS / width
-        if search is None:
-            candidates = given[given <= reach]
-        else:
-            candidates, clearest = search.strongest(errors, most, below=reach)
+        candidates = listed[listed <= reach]
+        if search is not None:
+            strongest, clearest = search.strongest(errors, most, below=reach)
             clear = np.union1d(clear, clearest)
+            candidates = np.append(strongest, np.setdiff1d(candidates, strongest))
             if clearest.size:
                 candidates = candidates[search.plausible(
                     errors, candidates, cycles=len(grid.cycles))]
-        # at most half as many unknowns as a cycle has samples
-        room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
-        candidates = np.sort(candidates[room])
         if not len(candidates):
             break
-        model = compress(grid, cycle_length=cycle_length, first_angle=first_angle,
-                         orders=candidates, spread=spread)
+        leaking = not _whole(np.append(candidates, listed) * cycle_length)
+        if leaking:
+            candidates = np.append(candidates, np.setdiff1d(listed, candidates))
+        columns = np.cumsum([2 * nodes_for(g * spread) for g in candidates])
+        model = compress(grid, cycle_length=cycle_length, first_angle=first_angle, spread=spread,
+                         orders=np.sort(candidates[columns <= _MOST_COLUMNS]))
         significant = significant_orders(model, errors, tests=len(known), least=rounding)
-        found = np.flatnonzero(significant.any(axis=1))
-        chosen = found[candidates[found] * width <= _SAFE_TURNS]
-        if np.array_equal(candidates[chosen], used):  # no further order is safe: try the next one
+        found = np.flatnonzero(significant.any(axis=1) & (model.orders <= reach))
+        chosen = found[model.orders[found] * width <= _SAFE_TURNS]
+        if np.array_equal(model.orders[chosen], used):  # no further order is safe: try the next
             chosen = found[:len(chosen) + 1]
-        if not len(chosen) or np.array_equal(candidates[chosen], used):
+        if not len(chosen) or np.array_equal(model.orders[chosen], used):
             break
-        first, used = problem is None, candidates[chosen]
-        problem = PulseErrorProblem(model, chosen, significant[chosen])
+        first, used = problem is None, model.orders[chosen]
+        fitted = chosen if not leaking else np.flatnonzero(
+            significant.any(axis=1) | np.isin(model.orders, listed))
+        problem = PulseErrorProblem(
+            model, fitted, np.isin(fitted, chosen)[:, None] & significant[fitted])
         if first and used[-1] * width > _SAFE_TURNS:
             errors = problem.scan(width)
         fit = problem.solve(errors, declared=declared)

@@ -41,6 +41,7 @@ _FAR_BELOW = 0.3
 _COHERENCE = 0.15
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
+_TINY = float(np.finfo(float).tiny)
 _POLE = 1e-8  # lines that are no nearer to a bin: there the lobe is a quotient of two zeros
 _CLEAR = 100.0  # times the power of the orders around
 # Candidates, over those wanted, whose lines are separated, and how far apart they must be.
@@ -87,13 +88,17 @@ class LineSearch:
         g = self.orders[self.orders <= below]
         if not len(g):
             return g, g
-        lines = self._lines(errors, g)
+        series = self._series(errors, g)
+        lines = series.sum(axis=1)
         power = np.abs(lines) ** 2
         # With repeated values at the border order 1 could not exceed its background.
         background = np.maximum(np.stack([
             median_filter(row, size=_NEIGHBOURHOOD, mode='reflect')
-            for row in np.ascontiguousarray(power.T)], axis=1), np.finfo(float).tiny)
+            for row in np.ascontiguousarray(power.T)], axis=1), _TINY)
         level = np.median(background, axis=0)
+        # Where harmonics are dense it is their own level, and less changes from cycle to cycle.
+        background = np.minimum(background, self._coherent(series)[1] * np.sum(
+            cycle_weights(series.shape[1]) ** 2))
         contrast = np.max(power / background, axis=1)
         telling = np.max((g**2)[:, None] * power / level, axis=1)
         telling = np.where(contrast > _CLEAR, telling, 0.0)
@@ -101,7 +106,7 @@ class LineSearch:
         # What a strong order shows at its neighbours must not take the room of weaker orders.
         own = np.abs(np.linalg.lstsq(self._shown(errors, g[best]), lines[best], rcond=_APART)[0])
         share = np.minimum(1.0, np.max(
-            own**2 / np.maximum(power[best], np.finfo(float).tiny), axis=1))
+            own**2 / np.maximum(power[best], _TINY), axis=1))
         best = best[np.lexsort((-contrast[best] * share, -telling[best] * share))[:most]]
         return g[best], g[best[contrast[best] > _CLEAR]]
 
@@ -111,17 +116,22 @@ class LineSearch:
 
         What is far below the level of `significant_orders` need not be fitted.
         """
-        _, count, channels = self.spectra.shape
-        series = np.array([np.einsum('bk,bkc->kc', weight, spectra) for weight, spectra in
-                           self._lobes(errors, g, tapered=False)]).reshape(-1, count, channels)
-        if count < 2:
-            return np.ones(len(g), np.bool_)
-        mean = series.mean(axis=1)
-        scatter = np.maximum(np.sum(np.abs(series - mean[:, None]) ** 2, axis=1) / (count - 1),
-                             np.finfo(float).tiny)
-        power = np.abs(mean) ** 2 - scatter / count
+        series = self._series(errors, g)
+        power, scatter = self._coherent(series)
         limit = significance(len(self.orders) * series.shape[2], cycles)
-        return np.asarray((cycles * power > _FAR_BELOW * limit * scatter).any(axis=1))
+        return np.asarray((cycles * (power - scatter / series.shape[1])
+                           > _FAR_BELOW * limit * scatter).any(axis=1))
+
+    def _coherent(self, series: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """
+        Return the power (order, channel) of the mean of a series, and its variance over cycles.
+
+        Without the taper over the cycles.
+        """
+        series = series / cycle_weights(series.shape[1])[:, None]
+        mean = series.mean(axis=1)
+        squares = np.sum(np.abs(series - mean[:, None]) ** 2, axis=1)
+        return np.abs(mean) ** 2, np.maximum(squares / (series.shape[1] - 1), _TINY)
 
     def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
         """Return what (row) orders show of unit lines at each order (column)."""
@@ -141,22 +151,21 @@ class LineSearch:
         Orders are weighted by their square, as in the fit of the errors. True pulse errors can
         only give a value above 1; without orders it is 1.
         """
-        before, after = (np.abs(self._lines(item, orders, tapered=False)) ** 2
+        before, after = (self._coherent(self._series(item, orders))[0]
                          for item in (0.0 * errors, errors))
-        weight = orders[:, None] ** 2 / np.maximum(np.sum(before, axis=0), np.finfo(float).tiny)
+        weight = orders[:, None] ** 2 / np.maximum(np.sum(before, axis=0), _TINY)
         known = float(np.sum(weight * before))
         return float(np.sum(weight * after)) / known if known else 1.0
 
-    def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
-        channels = self.spectra.shape[2]
-        # The bins around an order are one piece of memory, so that this is a product.
-        return np.array([weight.ravel() @ spectra.reshape(-1, channels) for weight, spectra in
-                         self._lobes(errors, g, tapered=tapered)]).reshape(-1, channels)
+    def _series(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
+        """Return the amplitudes (order, cycle, channel), tapered over the cycles."""
+        return np.array([np.einsum('bk,bkc->kc', weight, spectra) for weight, spectra in
+                         self._lobes(errors, g)]).reshape(-1, *self.spectra.shape[1:])
 
-    def _lobes(self, errors: FloatArray, g: FloatArray, *, tapered: bool
+    def _lobes(self, errors: FloatArray, g: FloatArray
                ) -> Iterator[tuple[ComplexArray, ComplexArray]]:
         """Yield weights (bin, cycle) and bins (bin, cycle, channel) around each order."""
-        lines, count, _ = self.spectra.shape
+        lines = len(self.spectra)
         angle = self.cycle_length * self.numbers + errors[self.begins]
         longer = errors[self.begins + 1] - errors[self.begins]
         nearest = np.rint(g * self.cycle_length).astype(np.intp)
@@ -165,8 +174,6 @@ class LineSearch:
         # Hann's lobe 0.5 sin(pi x) / (pi x (1 - x^2)) times exp(-j pi x): the signs that an offset
         # gives to both cancel.
         common = np.exp(-1j * pi * (2.0 * np.outer(g, angle) + x)) * np.sin(pi * x) / (2.0 * pi)
-        if not tapered:
-            common = common / cycle_weights(count)
         x = x[:, None] - np.arange(-_MAIN_LOBE, _MAIN_LOBE + 1)[:, None]
         weights = common[:, None] / (x * (1.0 - x) * (1.0 + x))
         for near, weight in zip(nearest.tolist(), weights):
