@@ -37,17 +37,15 @@ from sa_jitter_ros.effects.lattice import (
     Clock, coarsest_clock, ROOM, SAME_RATE, smooth_on_grid)
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
-from sa_jitter_ros.inference.cycle_states import independent_power
 from sa_jitter_ros.inference.line_search import APART, nearest_orders
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
-from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
 from sa_jitter_ros.inference.timing_data import (
-    ALIASES, FEWEST, NOISE, Stretch)
+    ALIASES, FEWEST, Stretch)
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
@@ -74,34 +72,6 @@ class Timing:
     def checks(self) -> tuple[Check, ...]:
         """Return the tests of what is left."""
         return check_timing(self.chooser, self.choice)
-
-    @property
-    def hidden_by(self) -> float:
-        """
-        Return what single errors are wrong by (s) where they are little else, 0 where they are.
-
-        That is where the noise of the vibration is far more than the pulses themselves scatter by,
-        and aligning a line to it changes the line: one that is not there, or comes and goes.
-        """
-        fit, data = self.choice.fit, self.chooser.data
-        if self.choice.quantised or data.referenced:
-            return 0.0
-
-        def mean(values: Sequence[Any]) -> float:
-            return float(np.average(values, weights=data.lengths))
-
-        stated = mean([item.error_std**2 for item in data.stretches])
-        possible_power = mean([
-            independent_power(np.diff(item.setting.times, 3)) for item in data.stretches])
-        left = data.unit**2 * mean([
-            np.var(self.chooser.left(fit, item)) for item in data.stretches])
-        noise = math.exp(float(fit.starts[NOISE][0])) * stated
-        model = self.choice.setting.model
-        size = max(model.distribution.variance, left - noise)
-        turn = 2.0 * math.pi * max(model.orders) * model.fundamental_frequency
-        hidden = (RESOLVED**2 * stated > possible_power and noise > RESOLVED**2 * size
-                  and 0.5 * turn**2 * noise > ACCURACY)
-        return math.sqrt(noise) if hidden else 0.0
 
 
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
