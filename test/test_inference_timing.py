@@ -253,6 +253,20 @@ def test_motion_of_a_few_swings_is_a_drift():
         assert (surest(timing.checks, 'a drift of the source') == 0.0) == few
 
 
+@pytest.mark.machines
+def test_pulse_errors_of_one_band_are_no_random_effect(rng):
+    """No sinusoid stands out of them, but their power is that of no effect."""
+    frequency = np.fft.rfftfreq(600)
+    for seed in range(3):
+        part = machine(500 + seed, count=600)
+        waves = np.fft.rfft(rng.standard_normal(600))
+        band = np.fft.irfft(waves * ((frequency > 0.2) & (frequency < 0.3)), 600)
+        band *= 2.0 * UNIT / band.std()
+        timing = read_timing([replace(part, errors=part.errors + band, setting=replace(
+            part.setting, times=part.setting.times + band))])
+        assert min(check.p_value for check in timing.checks) < 1e-5
+
+
 def test_memory_is_no_longer_than_a_third_of_a_stretch():
     parts = [machine([7, k], count=21, excess=3.0, rho=0.8) for k in range(20)]
     fit = Chooser(parts).fit(frozenset({'correlated_jitter'}))

@@ -175,11 +175,7 @@ def _of_scale(timing: Timing) -> tuple[float | None, Effect | None]:
 
 
 def _of_speed(timing: Timing) -> Effect | None:
-    """
-    Return the largest acceleration that the bends, and lines that stand for some, allow.
-
-    A shaft that twists steadily makes sidebands, which leave no bend to see.
-    """
+    """Return the largest acceleration that the bends allow."""
     parts = timing.chooser.data.stretches
     if not all(np.isfinite(item.bend_std) for item in parts):
         return None
@@ -187,6 +183,5 @@ def _of_speed(timing: Timing) -> Effect | None:
     noise = float(np.mean([item.bend_std**2 for item in parts]))
     power = largest_power(float(np.mean(bends**2)) - noise, bends.size, noise, noise**2,
                           memory(ACCELERATION_BAND))
-    power += max(item.twist for item in parts) ** 2
     return None if math.isinf(power) else SpeedFluctuation.of_ripple(
         math.sqrt(power), timing.choice.setting.model)

@@ -108,13 +108,10 @@ def unresolved(observation: Observation) -> str:
     known = observation.stacked('standard_errors')
     known = known[np.isfinite(known)]
     if known.size:
-        return too_unsure(float(np.sqrt(np.mean(known**2))))
+        size = float(np.sqrt(np.mean(known**2)))
+        return _no_line(f'the vibration shows an error of a single pulse to {size:.2g} s only; '
+                        'smaller errors could not have been seen')
     return _no_line(next(item.reason for item in observation.acquisitions if item.reason))
-
-
-def too_unsure(size: float) -> str:
-    return _no_line(f'the vibration shows an error of a single pulse to {size:.2g} s only; '
-                    'smaller errors could not have been seen')
 
 
 def _no_line(reason: str) -> str:

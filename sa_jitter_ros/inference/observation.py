@@ -176,13 +176,6 @@ class Observation:
         first = np.array([item.first for item in self.acquisitions])
         return np.cumsum(np.diff(first, prepend=first[:1] - 1) <= 0)
 
-    def uncorrected(self) -> 'Observation':
-        """Return the observation of one whose recovered errors tell nothing of the amplitudes."""
-        return replace(self, acquisitions=tuple(replace(
-            item, cycles=clean, noise=radial_noise(clean), recovered=False)
-            for item in self.acquisitions
-            for clean in [_clean(item.raw_cycles, self.model, self.sources)]))
-
     def stacked(self, field: str) -> Array:
         """Return one field of all acquisitions as an array."""
         return np.array([getattr(item, field) for item in self.acquisitions])

@@ -24,13 +24,12 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.averaging.spectral_lines import hann
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, band_of_ripple, ripple_correlation, slow_band, WIDEST)
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
-    beyond_chance, departs, Finding, ODDS, ONE_SIDED, parameter_ranges, possible)
+    beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
@@ -38,17 +37,15 @@ from sa_jitter_ros.effects.lattice import (
     Clock, coarsest_clock, ROOM, SAME_RATE, smooth_on_grid)
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
-from sa_jitter_ros.inference.cycle_states import independent_power
 from sa_jitter_ros.inference.line_search import APART, nearest_orders
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
-from sa_jitter_ros.inference.residual import ACCURACY
-from sa_jitter_ros.inference.timing_checks import BESIDE, Check, check_timing
+from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
 from sa_jitter_ros.inference.timing_data import (
-    ALIASES, FEWEST, NOISE, SteadyTorsion, Stretch)
+    ALIASES, FEWEST, Stretch)
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
@@ -76,34 +73,6 @@ class Timing:
         """Return the tests of what is left."""
         return check_timing(self.chooser, self.choice)
 
-    @property
-    def hidden_by(self) -> float:
-        """
-        Return what single errors are wrong by (s) where they are little else, 0 where they are.
-
-        That is where the noise of the vibration is far more than the pulses themselves scatter by,
-        and aligning a line to it changes the line: one that is not there, or comes and goes.
-        """
-        fit, data = self.choice.fit, self.chooser.data
-        if self.choice.quantised or data.referenced:
-            return 0.0
-
-        def mean(values: Sequence[Any]) -> float:
-            return float(np.average(values, weights=data.lengths))
-
-        stated = mean([item.error_std**2 for item in data.stretches])
-        possible_power = mean([
-            independent_power(np.diff(item.setting.times, 3)) for item in data.stretches])
-        left = data.unit**2 * mean([
-            np.var(self.chooser.left(fit, item)) for item in data.stretches])
-        noise = math.exp(float(fit.starts[NOISE][0])) * stated
-        model = self.choice.setting.model
-        size = max(model.distribution.variance, left - noise)
-        turn = 2.0 * math.pi * max(model.orders) * model.fundamental_frequency
-        hidden = (RESOLVED**2 * stated > possible_power and noise > RESOLVED**2 * size
-                  and 0.5 * turn**2 * noise > ACCURACY)
-        return math.sqrt(noise) if hidden else 0.0
-
 
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
     """Return the unbroken stretches of pulses of some acquisitions; neighbours are in one."""
@@ -129,84 +98,19 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
                 continue
             stretch = _stretch(model, recovery, part, here, grids[number], clock.rate, unit,
                                reference)
-            sidebands, bends = _sidebands(fit, model)
-            shown, most, p_value = _bends_of_motion(stretch.setting.times, sidebands)
-            # faster ones are no acceleration of the band
-            slow = _turn(sidebands) <= ACCELERATION_BAND[1] + APART / fit.errors.size
-            twist = np.sqrt(0.5 * np.sum(np.minimum(bends, most)[slow] ** 2))
-            # slower ones are no torsion, but a run-up
-            torsion = [SteadyTorsion(*row) for row in zip(
-                _turn(sidebands), np.minimum(bends, shown) / math.sqrt(2.0), p_value)
-                if row[0] > ACCELERATION_BAND[0]]
-            found.append(replace(stretch, sidebands=sidebands, twist=float(twist),
-                                 torsion=min(torsion, key=lambda item: item.p_value, default=None),
+            found.append(replace(stretch, sidebands=_sidebands(fit, model),
                                  held=fit.held or observation.against_reference))
     return found
 
 
-def _sidebands(fit: RecordFit, model: DeclaredModel) -> tuple[Array, Array]:
-    """
-    Return how far sidebands of several lines are from these, in cycles a trigger cycle.
-
-    The bends (s) follow, as peak values, that they stand for if the shaft twists. What repeats
-    with the revolution is no torsion, but gears.
-    """
+def _sidebands(fit: RecordFit, model: DeclaredModel) -> Array:
+    """Return how far sidebands of several lines are from these, in cycles a trigger cycle."""
     declared, others = np.split(fit.orders, [fit.declared])
-    near, offset = nearest_orders(others, declared)
-    turns, least = np.abs(offset) * model.cycle_length, APART / fit.errors.size
-    chosen = np.flatnonzero((turns > least) & (turns < ALIASES.max()))
-    chosen = chosen[np.argsort(turns[chosen])]
-    groups = [group for group in np.split(
-        chosen, np.flatnonzero(np.diff(turns[chosen]) > least) + 1) if group.size > 1]
-    places = np.array([turns[group].mean() for group in groups])
-    turn, order = _turn(places), places / model.cycle_length
-    twists = np.abs(order - np.rint(order)) * model.cycle_length >= least
-    even = np.sinc(places) ** 2  # share that an even angle between pulses makes there
-    swing = np.array([_swing(fit, group, near[group], offset[group]) if twisted else 0.0
-                      for group, twisted in zip(groups, twists)])
-    bends = swing / np.where(places > 0.5, even, 1.0 - even) * np.pi * turn**2
-    return places, np.asarray(bends / model.fundamental_frequency)
-
-
-def _swing(fit: RecordFit, group: Array, near: Array, offset: Array) -> float:
-    """
-    Return the largest angle (rad) that sidebands turn one of the lines near them by.
-
-    Upper and lower ones of a torsion are opposite, at equal distances `offset`.
-    """
-    swings = []
-    for line in np.unique(near).tolist():
-        carrier = fit.amplitudes[:, line]
-        channel, own = int(np.argmax(np.abs(carrier))), near == line
-        size = fit.amplitudes[channel, fit.declared + group[own]] / carrier[channel]
-        upper = offset[own] > 0.0
-        swings.append(float(np.abs(size[upper].sum() - np.conj(size[~upper].sum()))
-                            / fit.orders[line]))
-    return max(swings)
-
-
-def _turn(places: Array) -> Array:
-    """Return the frequencies of the images that an even angle leaves."""
-    return np.asarray(np.abs(places - np.rint(places)))
-
-
-def _bends_of_motion(times: Array, frequency: Array) -> tuple[Array, Array, Array]:
-    """
-    Return the peak bends (s) of sinusoids of some frequencies that pulse times show.
-
-    The largest that they allow follow, and the chance of as much power as there is in one, beside
-    that of its neighbours.
-    """
-    second = np.diff(times, 2)
-    window, turns = hann(second.size), -2j * np.pi * np.arange(second.size)
-    beside = np.array([0, *range(-BESIDE, -2), *range(3, BESIDE + 1)]) / second.size
-    size = np.array([np.abs(np.exp(np.multiply.outer(place + beside, turns)) @ (window * second))
-                     for place in frequency]).reshape(-1, beside.size)
-    count = beside.size // 4  # neighbours in the window are not independent
-    ratio = size[:, 0] ** 2 / np.mean(size[:, 1:] ** 2, axis=1)
-    noise = ONE_SIDED * math.sqrt(0.5 * np.sum((window * second) ** 2))
-    scale = 1.0 / window.sum() / np.sinc(_turn(frequency)) ** 2
-    return scale * size[:, 0], scale * (size[:, 0] + noise), (1.0 + ratio / count) ** -count
+    turns = np.sort(np.abs(nearest_orders(others, declared)[1])) * model.cycle_length
+    least = APART / fit.errors.size
+    turns = turns[(turns > least) & (turns < ALIASES.max())]
+    groups = np.split(turns, np.flatnonzero(np.diff(turns) > least) + 1)
+    return np.array([group.mean() for group in groups if group.size > 1])
 
 
 def _of_average(observation: Observation, item: Acquisition, unit: float, grid: Array | None,

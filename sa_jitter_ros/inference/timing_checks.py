@@ -21,9 +21,9 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import EFFECTS
-from sa_jitter_ros.effects.timing import MOTION, PULSES, SOURCE
+from sa_jitter_ros.effects.timing import PULSES, SOURCE
 from sa_jitter_ros.inference.line_search import APART
-from sa_jitter_ros.inference.timing_choice import Choice, Chooser, SIDEBANDS
+from sa_jitter_ros.inference.timing_choice import Choice, Chooser
 from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import EDGE, through
@@ -32,8 +32,7 @@ _DECLARED, _SCALED, _TICKS = 'declared', 'scaled', 'ticks'
 #: Draws of what is there by chance, and their seed.
 DRAWS, SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
-#: Frequencies on either side of a sinusoid that show what is there without it.
-BESIDE = 8
+_BESIDE = 8  # frequencies on either side of a sinusoid, that show what is there without it
 _FEWEST = 40  # pulses whose distribution is looked at
 _FEW_VALUES = 12.0  # six swings, below which a random motion is not told from a drift
 _TAIL = 0.1  # share of the draws that are their tail
@@ -56,9 +55,8 @@ class Check:
 
 def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     """Return all checks of the best fit; few where the ticks of a clock hide what is left."""
-    torsion = _torsion(chooser.data.stretches)
     if choice.quantised:
-        return torsion
+        return ()
     tests = [(_power, PULSES), (_sinusoid, PULSES)]
     if not chooser.data.referenced:  # other pulses show nothing of the source
         # of a motion of the source nothing is known but its bandwidth, and that it has one
@@ -70,10 +68,10 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
                   for alias in range(ALIASES.size)), key=lambda item: item.p_value)
              for check, direction in tests]
     if chooser.on_ticks(fit):  # near the edges of ticks, jitter makes errors of a whole one
-        return (*found, *torsion)
+        return tuple(found)
     lasting = [name for name, item in fit.spectra.items()
                if name in EFFECTS and len(item.upper) > 1]
-    return (*found, *torsion, _shape(chooser, choice),
+    return (*found, _shape(chooser, choice),
             *(_events(chooser, choice, name) for name in lasting),
             *(_drift(choice, name) for name in lasting), _steadiness(chooser, choice))
 
@@ -93,7 +91,7 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
         return np.array([np.convolve(row, window, 'same') for row in np.atleast_2d(gain)])
 
     draws = np.random.default_rng(SEED).gamma(size, 1.0 / size, (DRAWS, size.size))
-    ratio = np.where(_identifiable(fit, inverse), fit.excess(direction, inverse), 1.0)
+    ratio = fit.excess(direction, inverse)
     gain = statistic(ratio)[0]
     top = int(np.argmax(gain))
     near = slice(max(top - _BINS // 2, 0), top + _BINS // 2 + 1)
@@ -108,20 +106,20 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
 def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid in a direction stands out; `inverse` is as in `_power`."""
     size, unit = _waves(fit, inverse, direction)
-    return _highest(fit, inverse, direction, size, unit, np.exp(-size))
+    return _highest(fit, direction, size, unit, np.exp(-size))
 
 
 def _narrow(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid stands out of a random motion whose spectrum nobody knows."""
     size, unit = _waves(fit, inverse, direction)
     count = len(fit.data.lengths)  # ordinates of each frequency
-    near, far = 3 * count, (3 + BESIDE) * count
+    near, far = 3 * count, (3 + _BESIDE) * count
     place, sums = np.arange(size.size), np.append(0.0, np.cumsum(size))
     ends = np.clip([place - far + 1, place - near + 1, place + near, place + far], 0, size.size)
     beside = sums[ends[1]] - sums[ends[0]] + sums[ends[3]] - sums[ends[2]]
     known = ends[1] - ends[0] + ends[3] - ends[2]
     ratio = size / np.maximum(np.maximum(known, beside), 1.0)
-    return _highest(fit, inverse, direction, size, unit, (1.0 + ratio) ** -known)
+    return _highest(fit, direction, size, unit, (1.0 + ratio) ** -known)
 
 
 def _waves(fit: TimingFit, inverse: Array, direction: str) -> tuple[Array, Array]:
@@ -134,40 +132,16 @@ def _waves(fit: TimingFit, inverse: Array, direction: str) -> tuple[Array, Array
     return np.abs(np.einsum('fi,fij,fj->f', wave.conj(), inverse, fit.left)) ** 2 / known, known
 
 
-def _highest(fit: TimingFit, inverse: Array, direction: str, size: Array, unit: Array,
-             by_chance: Array) -> Check:
+def _highest(fit: TimingFit, direction: str, size: Array, unit: Array, by_chance: Array
+             ) -> Check:
     """Return the test of the sinusoid that is there least `by_chance` (ordinate,)."""
     data, frequency = fit.data, fit.data.each
-    # slower ones are a drift
-    tried = (frequency > APART / data.longest) & _identifiable(fit, inverse)[data.bin]
+    tried = frequency > APART / data.longest  # slower ones are a drift
     top = int(np.argmin(np.where(tried, by_chance, 2.0)))
     count = int(np.count_nonzero(tried))
     return Check(-math.expm1(count * math.log1p(-min(float(by_chance[top]), 1.0 - 1e-9))),
                  direction, data.unit * math.sqrt(2.0 * size[top] / unit[top] / data.longest),
                  f'a sinusoid of the {direction} of {frequency[top]:.4g} cycles a trigger cycle')
-
-
-def _torsion(stretches: Sequence[Stretch]) -> tuple[Check, ...]:
-    """
-    Test whether the pulse times move as the sidebands say that the shaft twists.
-
-    The lines are steady beside their sidebands, so that no recovery shows what averages lose.
-    """
-    found = [(len(item.sidebands), item.torsion) for item in stretches if item.torsion]
-    return tuple(Check(
-        min(1.0, count * torsion.p_value), MOTION, torsion.bend / math.sqrt(30.0),  # of u (1 - u)
-        f'the shaft twists steadily, {torsion.frequency:.3g} times a trigger cycle or a whole '
-        'number more: the lines have sidebands there, the pulse times move with them, and '
-        'averages lose what the angle between the pulses misses of it')
-        for count, torsion in found)
-
-
-def _identifiable(fit: TimingFit, inverse: Array) -> Array:
-    """Return which bins (bin,) show more than sidebands, whose shape nobody knows."""
-    if SIDEBANDS not in fit.spectra:
-        return np.ones(fit.data.size.size, np.bool_)
-    made = fit.density(SIDEBANDS, fit.parameters)[0][0]
-    return np.asarray(made < 0.5 * fit.floor(SOURCE, inverse))
 
 
 def _shape(chooser: Chooser, choice: Choice) -> Check:

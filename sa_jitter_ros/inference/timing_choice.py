@@ -371,19 +371,8 @@ class Chooser:
                     fit = self._on_ticks(alone)
                     if fit is not None:
                         self.fits[alone | clocks] = fit
-                        return self._with_sidebands(alone, alone | clocks)
+                        return alone | clocks
         return frozenset()
-
-    def _with_sidebands(self, alone: frozenset[str], best: frozenset[str]) -> frozenset[str]:
-        """Return what ticks leave, and sidebands beside it if these make bends in the cycles."""
-        more = alone | {SIDEBANDS}
-        if SIDEBANDS not in self.spectra or self.score(more, self.fit(more)) < self.score(
-                alone, self.fit(alone)):
-            return best
-        fit, quantised = copy(self.fit(more)), self.fits[best]
-        fit.sizes, fit.size_covariance = quantised.sizes, quantised.size_covariance
-        self.fits[best | {SIDEBANDS}] = fit
-        return best | {SIDEBANDS}
 
     def choice(self, best: frozenset[str]) -> Choice:
         """Return the choice of a set."""

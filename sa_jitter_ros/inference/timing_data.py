@@ -40,20 +40,6 @@ FEWEST = 12
 
 
 @dataclass(frozen=True)
-class SteadyTorsion:
-    """
-    A steady torsion of the shaft that sidebands and pulse times show alike.
-
-    It turns by `frequency` cycles a trigger cycle, or by whole ones more, and bends the cycles by
-    `bend` (s, RMS); `p_value` is the chance of the sinusoid in the pulse times.
-    """
-
-    frequency: float
-    bend: float
-    p_value: float
-
-
-@dataclass(frozen=True)
 class Stretch:
     """
     Consecutive trigger pulses and what was recovered at them.
@@ -63,9 +49,8 @@ class Stretch:
     infinite for none); `bends` (cycle,) in s are the factors of u (1 - u) inside the cycles, not
     shrunk, with the noise `bend_std` that a prior of `bend_prior_std` left. Against a reference
     keyphasor (`referenced`) no motion of the source shows. `sidebands` (k,) are those of several
-    lines, in cycles a trigger cycle from them, `twist` (s) the RMS of the bends that they stand
-    for if the shaft twists, `torsion` the surest of these twists. Without a line that holds the
-    angle to the pulses (`held`) any drift between them may be there.
+    lines, in cycles a trigger cycle from them. Without a line that holds the angle to the pulses
+    (`held`) any drift between them may be there.
     """
 
     setting: Setting
@@ -78,8 +63,6 @@ class Stretch:
     bend_prior_std: float
     referenced: bool = False
     sidebands: Array = field(default_factory=lambda: np.zeros(0))
-    twist: float = 0.0
-    torsion: SteadyTorsion | None = None
     held: bool = True
 
 

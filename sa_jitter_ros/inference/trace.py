@@ -36,7 +36,7 @@ from sa_jitter_ros.inference.candidates import (
 from sa_jitter_ros.inference.gate import passed
 from sa_jitter_ros.inference.gathering import choose_lines
 from sa_jitter_ros.inference.limits import limits
-from sa_jitter_ros.inference.not_compared import nothing_compared, too_unsure, unresolved, UNSEEN
+from sa_jitter_ros.inference.not_compared import nothing_compared, unresolved, UNSEEN
 from sa_jitter_ros.inference.observation import CHANCE, Observation, together
 from sa_jitter_ros.inference.refinements import with_its_noise, with_its_ticks
 from sa_jitter_ros.inference.remainder import (
@@ -91,11 +91,6 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     declared = [_counted_anew(item, observations) for item in declared]
     bench = make_bench(observation, observations, recordings, declared)
     timing = timing_of(bench)
-    if timing is not None and (unsure := timing.hidden_by):
-        observations = [item.uncorrected() for item in observations]
-        whole = together(observations)
-        return nothing_compared(whole, declared, too_unsure(unsure),
-                                 make_bench(whole, observations, recordings, declared))
     return trace_bench(bench, timing, progress=progress)
 
 
