@@ -33,6 +33,7 @@ import sa_jitter_ros as sa
 from sa_jitter_ros.inference.record_fit import OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.record_recovery import recover_record
+from sa_jitter_ros.prediction.influence import common_turn
 from sa_jitter_ros.prediction.model import DeclaredModel
 from worse_pulses import with_slower_clock
 
@@ -47,7 +48,7 @@ class Fitted:
     The fit of a machine's recording and its truth.
 
     `true` (pulse,) are the errors of the trigger pulses (s, NaN where one is missing), `wrong` the
-    recovered errors less these, the mean taken out.
+    recovered errors less these, but for a delay and a turn of all, which are not observable.
     """
 
     machine: Machine
@@ -85,15 +86,19 @@ def fitted(names: tuple[str, ...], seed: int) -> Fitted:
     part = slice(inside[0], inside[-1] + 1)
     measured, true = measured[part], true[part]
     there = np.isfinite(measured)
+    times = np.interp(np.arange(measured.size), np.flatnonzero(there), measured[there])
     begin = time.process_time()
     found = OpenRecord(
-        samples, machine.sample_rate, machine.start_time,
-        np.interp(np.arange(measured.size), np.flatnonzero(there), measured[there]),
+        samples, machine.sample_rate, machine.start_time, times,
         measured=there, cycle_length=machine.cycle_length, orders=machine.orders.tolist(),
         jitter_std=1.0 / np.sqrt(12.0) / machine.keyphasor_rate).fit()
     seconds = time.process_time() - begin
-    wrong = found.errors - (measured - true)
-    return Fitted(machine, found, measured - true, wrong - np.nanmean(wrong), seconds)
+    wrong = (found.errors - (measured - true)) / found.standard_errors
+    common = np.stack([np.ones(times.size), common_turn(times - found.errors, there)], axis=1)
+    common /= found.standard_errors[:, None]
+    seen = np.isfinite(wrong)
+    wrong -= common @ np.linalg.lstsq(common[seen], wrong[seen], rcond=None)[0]
+    return Fitted(machine, found, measured - true, wrong * found.standard_errors, seconds)
 
 
 def measured(path: Path) -> str:
