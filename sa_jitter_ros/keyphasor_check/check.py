@@ -230,11 +230,7 @@ class _Check:
         recording = self._recording
         if recording.samples < _FEWEST_SAMPLES:
             return None
-        if recording.samples * recording.channels > _MOST_SAMPLES:
-            count = _MOST_SAMPLES // recording.channels
-            samples = next(recording.blocks(count))
-        else:
-            samples = recording.read()
+        samples = next(recording.blocks(_MOST_SAMPLES // recording.channels))
         bad = bad_channels(samples)
         for channel, reason in bad.items():
             self._warn(
