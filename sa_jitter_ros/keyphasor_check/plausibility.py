@@ -75,7 +75,8 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
     found = [*filter(None, [other_span(pulses, start, end)])]
     target = {'pulses_per_revolution': pulses_per_revolution, 'missing_teeth': missing_teeth,
               'pulses_per_trigger': pulses_per_trigger, **geometry}
-    unfit = _unfit(pulses, target)
+    validated = _validated(pulses, target)
+    unfit = _unfit(pulses, missing_teeth, *validated) if validated else []
     found += unfit
     if orders and not unfit:  # which has one cause with it
         found += weak_orders(recording, pulses, orders, ratio=ratio, **target)
@@ -96,12 +97,9 @@ def _validated(pulses: FloatArray, target: Mapping[str, Any]
     return validator, TriggerPulses.joined([validator.update(pulses), validator.flush()])
 
 
-def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
+def _unfit(pulses: FloatArray, missing_teeth: int, validator: PulseValidator,
+           triggers: TriggerPulses) -> list[str]:
     """Return what pulses (n,) in s do not have in common with their target."""
-    found = _validated(pulses, target)
-    if found is None:
-        return []
-    validator, triggers = found
     pulses = pulses[:_MOST_VALIDATED]
     messages, counts = validator.take_messages(), validator.finish()
     strays = counts.doubles + counts.early + counts.unlocked
@@ -113,8 +111,8 @@ def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
     inside = int(np.count_nonzero((pulses >= start) & (pulses <= end)))
     if end - start > _UNUSED * np.ptp(pulses) and inside > _UNUSED * pulses.size:
         of = f'{validator.pulses_per_revolution} marks a revolution'
-        if target['missing_teeth']:
-            of += f', {target["missing_teeth"]} of them missing'
+        if missing_teeth:
+            of += f', {missing_teeth} of them missing'
         return [f'the {inside} pulses from {start:.6g} s to {end:.6g} s give no trigger cycle: '
                 f'they are not those of a target with {of}; does the target, or the signal, '
                 'change there? Check pulses_per_revolution and missing_teeth (check_keyphasor '
