@@ -33,6 +33,7 @@ from sa_jitter_ros.errors import DataWarning, ModelError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.inference.trace_result import Trace
+from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
@@ -41,7 +42,7 @@ from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, with
 from sa_jitter_ros.report.report import parameters_text, report, summary
 
 Source = str | os.PathLike[str] | Recording
-Declared = str | os.PathLike[str] | Declaration | DeclaredModel | Mapping[str, Any]
+Declared = str | os.PathLike[str] | DeclaredModel | Mapping[str, Any]
 
 _VERDICTS = ('none', 'traced', 'unexplained')
 _SHAFT = 'shaft'  # name of the only one
@@ -169,11 +170,12 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     Find the effects that the declared jitter model of a machine lacks, from its recordings.
 
     `recordings` is one path or `Recording`, or several. `declared` is the path of a ROS parameter
-    file of `jitter_predictor`, a `DeclaredModel`, or a mapping of the keywords of `predict`, with
-    `effects` as a mapping of names to parameters. A parameter file may declare several `shafts`;
-    each gets a report. An undeclared `sample_rate` is that of the first recording. `names` are the
-    names of the recordings in the report, else their paths or descriptions. `progress` is
-    called with one line of text for every step.
+    file of `jitter_predictor`, or of the machine, of which the averager's target is taken, too; a
+    `DeclaredModel`, or a mapping of the keywords of `predict`, with `effects` as a mapping of
+    names to parameters. A parameter file may declare several `shafts`; each gets a report. An
+    undeclared `sample_rate` is that of the first recording. `names` are the names of the
+    recordings in the report, else their paths or descriptions. `progress` is called with one line
+    of text for every step.
 
     Raises RecordingError, ModelError or SignalError if the recordings cannot be read, do not
     match the declared model, or contain no order above the noise.
@@ -201,10 +203,11 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     if not recordings:
         raise ModelError('no recording: give at least one')
     names = tuple(names) or tuple(_name(*item) for item in enumerate(recordings, 1))
-    opened = [item if isinstance(item, Recording) else read(item)
-              for item in recordings]
+    opened = [item if isinstance(item, Recording) else read(item) for item in recordings]
     opened, faults = _usable(opened, names)
     opened = [_with_pulses(item) for item in opened]
+    if isinstance(declared, (str, os.PathLike)):
+        opened = [on_target(item, Path(declared)) for item in opened]
     declaration = _declaration(declared, opened[0].sample_rate)
     models, stated = declaration.models, any(item.ratio != 1.0 for item in opened)
     if len(models) > 1:
@@ -302,8 +305,6 @@ def _name(number: int, source: Source) -> str:
 
 def _declaration(declared: Declared, sample_rate: float) -> Declaration:
     """Return models and effects, declared in any of the forms; raises SaJitterError."""
-    if isinstance(declared, Declaration):
-        return declared
     if isinstance(declared, DeclaredModel):
         return Declaration({_SHAFT: declared}, ())
     if not isinstance(declared, (str, os.PathLike, Mapping)):

@@ -20,7 +20,7 @@ from sa_jitter_ros.errors import DataWarning, RecordingError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.loop import close_loop as loop
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
-from sa_jitter_ros.recordings import write_npz
+from sa_jitter_ros.recordings import read, write_npz
 from sa_jitter_ros.recordings.channel_check import bad_channels, usable_channels
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
@@ -81,6 +81,27 @@ def test_what_does_not_fit_is_said_once(recording, change, declared, text):
 @pytest.mark.parametrize(('factor', 'found'), [(2.0, 0), (0.5, 0), (6.0, 1), (0.1, 1)])
 def test_a_declared_jitter_of_another_size_is_named(recording, factor, found):
     assert len(of(recording, jitter_std=factor / CLOCK / np.sqrt(12.0))) == found
+
+
+@pytest.mark.parametrize('geometry', ['none', 'learn', 'given'])
+@pytest.mark.parametrize(('declared', 'found'), [(None, 0), (2e-5, 0), (2e-6, 1), (4e-4, 1)])
+def test_the_scatter_of_pulses_is_that_beside_their_uneven_marks(
+        gearbox, rng, geometry, declared, found):
+    late = rng.normal(0.0, 0.005, 8)
+    rig = gearbox(EIGHT + late - late.mean())
+    pulses = rig.pulse_times + rng.normal(0.0, 2e-5, rig.pulse_times.size)
+    said = doubts(rig, pulses, pulses_per_revolution=8, jitter_std=declared,
+                  target_geometry=geometry,
+                  target_angles=tuple(2.0 * np.pi * (late - late.mean())))
+    assert len(said) == found
+    assert all(text.startswith(('the pulses scatter by 19', 'the pulses scatter by 2'))
+               for text in said)
+
+
+def test_no_jitter_is_doubted_where_the_speed_hides_it(shared_data):
+    rig = read(shared_data / 'encoder_motor_slow.npz')
+    said, = doubts(rig, rig.pulse_times, pulses_per_revolution=16, jitter_std=1e-6)
+    assert said.startswith('the speed scatters so much')
 
 
 def test_a_standstill_is_no_other_target(recording):

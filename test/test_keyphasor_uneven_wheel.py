@@ -10,13 +10,18 @@
 
 """Wheels with an extra mark, or with marks at any angles: found, and averaged as declared."""
 
+import json
+
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
-from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
+from sa_jitter_ros.keyphasor_check.machine_file import machine_file, machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import number_and_patterns
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
+from sa_jitter_ros.nodes.recording_player import RecordingPlayer
+from sa_jitter_ros.recordings import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 pytestmark = pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
@@ -110,3 +115,37 @@ def test_what_is_found_is_averaged_without_loss(rng):
     assert len(averages) >= 7
     for average in averages:
         assert np.max(np.abs(np.abs(average.amplitudes) - 1.0)) < 0.02
+
+
+@pytest.fixture
+def files(rng, tmp_path):
+    """Return the paths of a recording of a wheel with an extra mark, and of its machine file."""
+    pulses = pulses_on(rng, with_extra(12, 0.34), turns=300, ramp=0.0, jitter=2e-5)
+    turns = SPEED * np.arange(round(3000.0 * (pulses[-1] + 0.1))) / 3000.0
+    samples = np.cos(2.0 * np.pi * turns) + np.cos(48.0 * np.pi * turns)
+    recording = Recording(ArraySource((samples + 0.1 * rng.normal(size=turns.size))[None]), 3000.0,
+                          pulse_times=pulses)
+    write_npz(tmp_path / 'rig.npz', recording)
+    (tmp_path / 'rig.yaml').write_text(machine_file(check_keyphasor(recording), 'rig'))
+    return tmp_path / 'rig.npz', tmp_path / 'rig.yaml'
+
+
+@pytest.mark.machines
+def test_library_and_command_take_the_target_of_the_machine_file(files, capsys):
+    path, params = files
+    found = sa.close_loop(path, params)
+    assert found.faults == ()
+    assert close_loop.main([str(path), '--params', str(params), '--quiet',
+                            '--output', str(path.parent / 'out')]) == 0
+    report = json.loads((path.parent / 'out' / 'report.json').read_text())
+    assert found.report == {**report, 'created': found.created}
+    assert 'warning' not in capsys.readouterr().err
+
+
+def test_player_takes_the_target_of_the_machine_file(files, ros_graph):
+    path, params = files
+    alone, with_file = (ros_graph.add(RecordingPlayer, cli_args=[
+        '--ros-args', *given, '-p', f'recording:={path}', '-p', 'playing:=false'])
+        for given in ([], ['--params-file', str(params)]))
+    assert 'a stray comes after every 12 pulses' in alone._last_warning
+    assert with_file._last_warning == ''

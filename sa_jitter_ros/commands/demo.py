@@ -39,6 +39,7 @@ from sa_jitter_ros.commands.demo_plan import (
 from sa_jitter_ros.commands.demo_report import write_results
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, PredictionMessage)
@@ -315,6 +316,8 @@ def planned(options: argparse.Namespace) -> Plan:
     if not options.recording:
         return plan_simulation(options.params or shipped('machine.yaml'))
     recording, remarks = usable_channels(read(options.recording, **read_options(options)))
+    if options.params:
+        recording = on_target(recording, options.params)
     plan = plan_recording(options.recording, recording, keyphasor_rate=options.keyphasor_rate,
                           parameters=player_options(options))
     if options.params:

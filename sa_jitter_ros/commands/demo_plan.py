@@ -111,7 +111,7 @@ def plan_doubts(plan: Plan, recording: Recording) -> tuple[str, ...]:
     return doubts(
         recording, recording.keyphasor_pulses(), orders=model.orders, ratio=model.ratio,
         pulses_per_revolution=model.pulses_per_revolution,
-        pulses_per_trigger=model.pulses_per_trigger or None, missing_teeth=plan.missing_teeth,
+        pulses_per_trigger=model.pulses_per_trigger or None, **recording.target,
         jitter_std=1.0 / math.sqrt(12.0) / model.keyphasor_rate
         if declared and not plan.waveform and not plan.source_parameters.get('keyphasor_rate')
         else None)

@@ -14,14 +14,13 @@ import argparse
 from collections import Counter
 from functools import partial
 import os
-from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
     plain_warnings, read_options, run_to_end, show, tacholess_options)
 from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.declaration import Declaration, read_declaration
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.offline.files import write_rows
 from sa_jitter_ros.offline.fleet import is_folder
@@ -41,16 +40,8 @@ def run(options: argparse.Namespace, progress: Progress) -> Loop:
     tacholess = tacholess_options(options)
     recordings = [with_pulses(read(path, **read_options(options)), options.declared, tacholess)
                   for path in options.recordings]
-    declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
-    _tell_unknown(options.declared, declaration)
-    return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
-                      progress=progress.step)
-
-
-def _tell_unknown(path: Path, declaration: Declaration) -> None:
-    if declaration.unknown:
-        print(f'close_loop: {path}: ignored, because jitter_predictor has no such '
-              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
+    return close_loop(recordings, options.declared, progress=progress.step,
+                      names=[str(path) for path in options.recordings])
 
 
 def show_report(options: argparse.Namespace, progress: Progress) -> int:
@@ -69,7 +60,10 @@ def show_report(options: argparse.Namespace, progress: Progress) -> int:
 
 def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
     """Close the loop on each recording, and write their table; raises SaJitterError, OSError."""
-    _tell_unknown(options.declared, read_declaration(options.declared, sample_rate=1e9))
+    declaration = read_declaration(options.declared, sample_rate=1e9)
+    if declaration.unknown:
+        print(f'close_loop: {options.declared}: ignored, because jitter_predictor has no such '
+              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
     jobs, rows = jobs_of(options, partial(
         LoopJob, declared=os.path.abspath(options.declared), options=read_options(options),
         tacholess=tacholess_options(options)), LoopRow)

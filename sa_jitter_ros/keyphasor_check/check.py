@@ -17,6 +17,7 @@ says what decided it or would. Each warning says what it costs at each order, an
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache, partial
 import math
 
 import numpy as np
@@ -104,8 +105,6 @@ class _Check:
         self._rate, self._start = recording.sample_rate, recording.start_time
         self._warnings: list[Warn] = []
         self._from_waveform = recording.pulse_times is None and recording.tach is not None
-        self._orders: tuple[float, ...] = ()
-        self._largest = math.nan  # s, pulse time as recorded: the larger, the coarser its digits
         self._other_rate = 0.0  # with which the vibration is as long as the pulses
 
     def run(self) -> KeyphasorCheck:
@@ -116,12 +115,12 @@ class _Check:
         numbered, found = number_and_patterns(times)
         clock = find_clock(numbered.times, largest=self._largest)
         tick = 1.0 / clock.rate if clock.rate else 0.0
-        first = fit_pulses(numbered, 1, tick=tick)
+        fit = cache(partial(fit_pulses, numbered, tick=tick))
         samples = self._samples()
         lines = None
         if samples is not None:
             self._progress('looking for lines of the vibration over the angle')
-            base = first if not found else fit_pulses(numbered, found[0].teeth, tick=tick)
+            base = fit(found[0].teeth if found else 1)
             once = base.once_a_revolution()
             turned = base.true[once], base.numbers[once].astype(np.float64)
             lines = find_lines(samples.T, self._start, self._rate, *turned)
@@ -130,7 +129,7 @@ class _Check:
             marks = self._at_both_rates(marks, numbered, found, lines, find_lines(
                 samples.T, self._start, self._other_rate, *turned))
         count = int(marks.value)
-        fitted = first if count == 1 else fit_pulses(numbered, count, tick=tick)
+        fitted = fit(count)
         even = samples is not None and speed_ripples(samples, self._start, self._rate, fitted)
         if even and samples is not None:
             fitted = fitted.with_even_marks()
@@ -140,10 +139,9 @@ class _Check:
         _require_wheel(fitted, numbered)
         per_revolution = None if lines is None else lines.scaled(float(count))
         ratio, orders = self._ratio(per_revolution)
-        self._orders = tuple(orders.value or ())
         self._progress('measuring the jitter')
-        averages = {} if samples is None or not self._orders else self._averaged(
-            samples, times, fitted, ratio, clock)
+        averages = {} if samples is None or not orders.value else self._averaged(
+            samples, times, fitted, ratio, orders.value, clock)
         findings = {
             'pulses_per_revolution': marks,
             'missing_teeth': Checked(
@@ -157,7 +155,7 @@ class _Check:
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
             'path_delay': path_delay(averages.get(False, ()), float(ratio.value or 1.0))}
-        concerned = self._orders or NO_ORDERS
+        concerned = orders.value or NO_ORDERS
         from_marks = by_marks(fitted, float(ratio.value or 1.0), concerned)
         warnings = (*self._warnings, *contradictions(per_revolution, self._machine),
                     *costs(findings, fitted, times, concerned, from_marks))
@@ -179,6 +177,7 @@ class _Check:
         times = recording.keyphasor_pulses(detector=detector)
         if spikes := spikes_text(detector.state.spikes):
             self._warn('spikes', spikes)
+        # s, pulse time as recorded: the larger, the coarser its digits
         self._largest = float(np.max(np.abs(times), initial=0.0))
         whose = f'{times.size} pulses in {recording.duration:.4g} s'
         if times.size < FEWEST:
@@ -230,11 +229,7 @@ class _Check:
         recording = self._recording
         if recording.samples < _FEWEST_SAMPLES:
             return None
-        if recording.samples * recording.channels > _MOST_SAMPLES:
-            count = _MOST_SAMPLES // recording.channels
-            samples = next(recording.blocks(count))
-        else:
-            samples = recording.read()
+        samples = next(recording.blocks(_MOST_SAMPLES // recording.channels))
         bad = bad_channels(samples)
         for channel, reason in bad.items():
             self._warn(
@@ -342,14 +337,13 @@ class _Check:
             stated = recording.tach_rate
             return Checked(stated, None, 'Hz', (), 'stated by the recording' if stated else
                            'no grid in the pulse times: they are not rounded to a clock')
-        if is_decimal(clock.rate):
-            return Checked(clock.rate, clock.standard_error, 'Hz', (), 'all pulse times are '
-                           'multiples of its period, which may be their last written decimal')
+        by = ', which may be their last written decimal' if is_decimal(clock.rate) else ''
         return Checked(clock.rate, clock.standard_error, 'Hz', (),
-                       'all pulse times are multiples of its period')
+                       f'all pulse times are multiples of its period{by}')
 
     def _averaged(self, samples: FloatArray, times: FloatArray, fitted: FittedPulses,
-                  ratio: Checked, clock: Clock) -> dict[bool, tuple[Average, ...]]:
+                  ratio: Checked, orders: Sequence[float], clock: Clock
+                  ) -> dict[bool, tuple[Average, ...]]:
         """Return averages with corrected jitter (True), and short ones at their speed (False)."""
         measured = measure_jitter(fitted.true, fitted.numbers)
         size = measured.std if measured else fitted.scatter
@@ -360,7 +354,7 @@ class _Check:
         teeth = fitted.pattern.teeth
         return {correct: averages_of(
             samples, self._rate, kept, start_time=self._start, ratio=float(ratio.value or 1.0),
-            orders=list(self._orders), pulses_per_revolution=teeth,
+            orders=orders, pulses_per_revolution=teeth,
             missing_teeth=teeth - fitted.pattern.present, trigger_cycles=count,
             keyphasor_rate=1.0 / expected, correct_jitter=correct)
             for correct, count in cycles.items()}

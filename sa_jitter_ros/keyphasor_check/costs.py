@@ -52,12 +52,10 @@ def costs(findings: Mapping[str, Checked], fitted: FittedPulses, times: FloatArr
     `fitted` are the pulses `times` (n,) in s on their target; `from_marks` is what `by_marks`
     returns.
     """
-    found = _of_pulses(fitted, orders)
     ratio = float(findings['ratio'].value or 1.0)
-    found += _of_marks(fitted, ratio, orders)
-    found += _of_jitter(findings, fitted, ratio, orders)
-    found += _of_speed(fitted, ratio, orders, from_marks)
-    return found + _of_changes(times)
+    return [*_of_pulses(fitted, orders), *_of_marks(fitted, ratio, orders),
+            *_of_jitter(findings, ratio, orders),
+            *_of_speed(fitted, ratio, orders, from_marks), *_of_changes(times)]
 
 
 def _of_pulses(fitted: FittedPulses, orders: Sequence[float]) -> list[Warn]:
@@ -99,8 +97,8 @@ def _of_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> li
         _percent(orders, loss))]
 
 
-def _of_jitter(findings: Mapping[str, Checked], fitted: FittedPulses, ratio: float,
-               orders: Sequence[float]) -> list[Warn]:
+def _of_jitter(findings: Mapping[str, Checked], ratio: float, orders: Sequence[float]
+               ) -> list[Warn]:
     speed = findings['speed'].value['mean']
     clock, memory = findings['clock_rate'], findings['jitter_correlation']
     std = findings['jitter_std'].value

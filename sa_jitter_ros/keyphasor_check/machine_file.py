@@ -8,19 +8,24 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The machine file of a check: parameters of the nodes, as the findings have them."""
+"""The machine file of a check, with parameters of the nodes; its target for a recording."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 import math
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.averaging.averager_parameters import PARAMETERS
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.machine import following, PREFIX
-from sa_jitter_ros.parameter_file import nested, section_text
-from sa_jitter_ros.parameters import HARDWARE_ID
+from sa_jitter_ros.parameter_file import nested, read_parameters, section_text
+from sa_jitter_ros.parameters import converted, HARDWARE_ID
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
+from sa_jitter_ros.recordings.recording import Recording
 
 # close_loop compares no fewer cycles; cycles from mark to mark are more, and corrected together
 _LEAST_CYCLES, _MOST_CYCLES, _AVERAGES, _MOST_FROM_MARKS = 5, 100, 8, 400
@@ -31,6 +36,8 @@ _DISCARDED = 0.5  # of the trigger cycles of an average
 _COARSE, _TICKS, _WIDEST = 0.02, 2.5, 0.45  # of an interval
 _CLEAR = 4.0  # standard errors of a delay that is corrected
 _SHOWS = 1e-4  # rad, of the highest order, by which a mark is uneven enough
+_TARGET = {item.name: item for item in PARAMETERS if item.name in (
+    'pulses_per_revolution', 'missing_teeth', 'target_geometry', 'target_angles')}
 
 
 def machine_parameters(check: KeyphasorCheck, declared: Mapping[str, Any] = NOTHING
@@ -68,8 +75,7 @@ def machine_parameters(check: KeyphasorCheck, declared: Mapping[str, Any] = NOTH
         'live_view': {'shafts': common['shafts']}}
     pitch = 1.0 / (float(found['speed']['mean']) * count)
     if tick > _COARSE * pitch:  # intervals scatter by a tick to either side
-        nodes['synchronous_averager']['interval_tolerance'] = min(
-            _WIDEST, _TICKS * tick / pitch)
+        nodes['synchronous_averager']['interval_tolerance'] = min(_WIDEST, _TICKS * tick / pitch)
     target = MarkOffsets(np.array(check.findings['marks'].value),
                          np.array(check.findings['marks'].standard_error or 0.0))
     turn = np.abs(target.angles).max() * (found['ratio'] or 1.0) * max(found['orders'] or [1.0])
@@ -120,3 +126,21 @@ def machine_file(check: KeyphasorCheck, name: str, declared: Mapping[str, Any] =
                 **machine_parameters(check, declared)}
     return '\n'.join(lines) + '\n\n' + '\n'.join(
         section_text(node, parameters) for node, parameters in sections.items())
+
+
+def on_target(recording: Recording, params: Path) -> Recording:
+    """
+    Return a recording with the target that a machine file gives to the averager.
+
+    Marks and missing teeth of the recording are kept. Raises ParameterError for a wrong value.
+    """
+    try:
+        values = read_parameters(params, 'synchronous_averager')
+    except ParameterError:  # no section of the averager
+        return recording
+    target = converted(values, _TARGET)
+    angles = tuple(target.pop('target_angles', ()))
+    if target.pop('target_geometry', 'none') == 'given':
+        recording = replace(recording, target_angles=angles)
+    stated = recording.pulses_per_revolution > 1 and not target.get('missing_teeth')
+    return recording if recording.missing_teeth or stated else replace(recording, **target)

@@ -164,8 +164,6 @@ def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> Fitt
     `tick` is the period of the clock in s of which pulse times are multiples.
     """
     pattern = pattern_of(pulses, teeth)
-    if teeth == 1:
-        pattern = replace(pattern, marks=np.zeros(1), errors=np.full(1, np.nan))
     parts = pulses.unbroken()
     best = max(range(len(parts)), key=lambda k: parts[k].times.size)
     pattern, parts[best] = _fitted(parts[best], pattern, tick)
@@ -264,7 +262,6 @@ def _chosen_again(pulses: NumberedPulses, pattern: Marking) -> NumberedPulses:
 def _outliers(pulses: NumberedPulses, late: FloatArray, tick: float) -> NDArray[np.bool_]:
     """Return which pulses (n,) stand far from where their neighbours have them."""
     found = np.zeros(pulses.times.size, np.bool_)
-    index = np.arange(pulses.times.size)
     for _ in range(_MOST_AT_ONCE):
         index = np.flatnonzero(~found)
         if index.size < 6:

@@ -16,11 +16,11 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.arrays import FloatArray
+from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import find_lines
-from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses
+from sa_jitter_ros.keyphasor_check.teeth import FEWEST
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.unit_check import likely_mistake, other_span
 from sa_jitter_ros.pulses.validation import PulseValidator
@@ -75,12 +75,13 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
     found = [*filter(None, [other_span(pulses, start, end)])]
     target = {'pulses_per_revolution': pulses_per_revolution, 'missing_teeth': missing_teeth,
               'pulses_per_trigger': pulses_per_trigger, **geometry}
-    unfit = _unfit(pulses, target)
+    validated = _validated(pulses, target)
+    unfit = _unfit(pulses, missing_teeth, *validated) if validated else []
     found += unfit
     if orders and not unfit:  # which has one cause with it
         found += weak_orders(recording, pulses, orders, ratio=ratio, **target)
-    if jitter_std and not geometry:
-        found += _other_jitter(pulses, jitter_std)
+    if jitter_std:
+        found += _other_jitter(pulses, jitter_std, target)
     return tuple(found)
 
 
@@ -96,12 +97,9 @@ def _validated(pulses: FloatArray, target: Mapping[str, Any]
     return validator, TriggerPulses.joined([validator.update(pulses), validator.flush()])
 
 
-def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
+def _unfit(pulses: FloatArray, missing_teeth: int, validator: PulseValidator,
+           triggers: TriggerPulses) -> list[str]:
     """Return what pulses (n,) in s do not have in common with their target."""
-    found = _validated(pulses, target)
-    if found is None:
-        return []
-    validator, triggers = found
     pulses = pulses[:_MOST_VALIDATED]
     messages, counts = validator.take_messages(), validator.finish()
     strays = counts.doubles + counts.early + counts.unlocked
@@ -113,8 +111,8 @@ def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
     inside = int(np.count_nonzero((pulses >= start) & (pulses <= end)))
     if end - start > _UNUSED * np.ptp(pulses) and inside > _UNUSED * pulses.size:
         of = f'{validator.pulses_per_revolution} marks a revolution'
-        if target['missing_teeth']:
-            of += f', {target["missing_teeth"]} of them missing'
+        if missing_teeth:
+            of += f', {missing_teeth} of them missing'
         return [f'the {inside} pulses from {start:.6g} s to {end:.6g} s give no trigger cycle: '
                 f'they are not those of a target with {of}; does the target, or the signal, '
                 'change there? Check pulses_per_revolution and missing_teeth (check_keyphasor '
@@ -144,20 +142,14 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     if found is None:
         return ()
     validator, triggers = found
-    if triggers.times.size < 2:
-        return ()
-    gaps = np.diff(triggers.times, prepend=triggers.times[0])
-    # Between these parts the angle is not known, or the shaft stands still.
-    parts = np.cumsum(triggers.restarted | (gaps > _LONGEST_GAP * np.median(gaps)))
-    chosen = parts == np.argmax(np.bincount(parts))
-    times = triggers.times[chosen]
+    times, numbers = _longest(triggers)
     share = validator.pulses_per_trigger / validator.pulses_per_revolution
     count = round(min(_FIRST_SECONDS * recording.sample_rate, recording.samples,
                       _MOST_VALUES / recording.channels))
     samples = next(recording.blocks(max(count, 1)))
     lines = find_lines(
         np.nan_to_num(samples.T, posinf=0.0, neginf=0.0), recording.start_time,
-        recording.sample_rate, times, triggers.count[chosen] * share, weak=True)
+        recording.sample_rate, times, np.asarray(numbers * share, np.float64), weak=True)
     if lines is None:
         return ()
     places = ratio * np.asarray(orders)
@@ -165,8 +157,7 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     stand = sizes > 0.0
     chance = lines.share(0.8 * float(places.min()), 1.2 * float(places.max()))
     count, listed = int(np.count_nonzero(stand)), ', '.join(f'{order:g}' for order in orders[:6])
-    speed = share * (times.size - 1) / float(np.sum(np.diff(times) / np.maximum(
-        np.diff(triggers.count[chosen]), 1)))
+    speed = share * (times.size - 1) / float(np.sum(np.diff(times) / np.diff(numbers)))
     by_chance = float(special.betainc(count, stand.size - count + 1, chance)) if count else 1.0
     if count < stand.size and by_chance > _BY_CHANCE:
         beyond = ' more often than by chance' if count else ''
@@ -197,12 +188,15 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     return ()
 
 
-def _other_jitter(pulses: FloatArray, declared: float) -> list[str]:
+def _other_jitter(pulses: FloatArray, declared: float, target: Mapping[str, Any]) -> list[str]:
     """Return whether the pulses scatter by much more, or much less, than is declared."""
-    numbered = number_pulses(pulses[:_MOST_PULSES])
-    if numbered.times.size < FEWEST:
+    geometry = 'given' if target.get('target_geometry') == 'given' else 'learn'
+    validated = _validated(pulses[:_MOST_PULSES], {
+        **target, 'pulses_per_trigger': 1, 'target_geometry': geometry})
+    if validated is None or validated[0].hides_missing:
         return []
-    found = measure_jitter(numbered.times, numbered.numbers)
+    times, numbers = _longest(validated[1])
+    found = measure_jitter(times, numbers)
     if found is None or math.isnan(found.correlation):
         return []
     factor = found.std / declared
@@ -211,3 +205,15 @@ def _other_jitter(pulses: FloatArray, declared: float) -> list[str]:
         return []
     return [f'the pulses scatter by {1e6 * found.std:.3g} us, but {1e6 * declared:.3g} us are '
             'declared: check keyphasor_rate and jitter_std']
+
+
+def _longest(triggers: TriggerPulses) -> tuple[FloatArray, IntArray]:
+    """Return times in s and numbers (n,) of the longest part without a gap in the angle."""
+    if not triggers.times.size:
+        return triggers.times, triggers.count
+    gaps = np.diff(triggers.times, prepend=triggers.times[:1])
+    # Between these parts the angle is not known, or the shaft stands still.
+    parts = np.cumsum((np.diff(triggers.count, prepend=-1) <= 0) | (
+        gaps > _LONGEST_GAP * np.median(gaps)))
+    chosen = (parts == np.argmax(np.bincount(parts))) & triggers.measured
+    return triggers.times[chosen], triggers.count[chosen]

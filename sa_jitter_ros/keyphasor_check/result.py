@@ -66,14 +66,11 @@ class KeyphasorCheck:
     @property
     def report(self) -> dict[str, Any]:
         """Return the content of `keyphasor.json`."""
-        found: dict[str, Any] = {name: {
-            'value': item.value, 'standard_error': item.standard_error, 'unit': item.unit,
-            'alternatives': [{'value': value, 'probability': probability}
-                             for value, probability in item.alternatives],
-            'decided_by': item.decided_by} for name, item in self.findings.items()}
-        found['warnings'] = [{
-            'code': item.code, 'text': item.text,
-            'cost': [{'order': order, 'percent': percent} for order, percent in item.cost]}
+        found: dict[str, Any] = {name: {**vars(item), 'alternatives': [
+            {'value': value, 'probability': probability}
+            for value, probability in item.alternatives]} for name, item in self.findings.items()}
+        found['warnings'] = [{**vars(item), 'cost': [
+            {'order': order, 'percent': percent} for order, percent in item.cost]}
             for item in self.warnings]
         return found
 
@@ -83,8 +80,7 @@ class KeyphasorCheck:
         for item in self.warnings:
             worst = sorted(item.cost, key=lambda pair: -pair[1])[:_SHOWN]
             cost = ', '.join(f'order {g:g}: {percent:.2g} %' for g, percent in sorted(worst))
-            lines.append(f'! {item.code}: {item.text}'
-                         + (f' (loss at {cost})' if cost else ''))
+            lines.append(f'! {item.code}: {item.text}' + (f' (loss at {cost})' if cost else ''))
         return '\n'.join(lines)
 
 

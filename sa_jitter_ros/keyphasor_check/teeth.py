@@ -151,7 +151,6 @@ def _numbered(times: FloatArray, window: int, scale: float) -> NumberedPulses:
     intervals = np.maximum(np.diff(times), 1e-300)
     pitch = _middle(intervals / scale, window)
     silent = intervals > _STANDSTILL * pitch
-    kept = np.ones(times.size, np.bool_)
     strays = np.empty(0)
     for step in range(_PASSES):
         numbers, places, breaks = _places(times, pitch, silent, window)
@@ -164,18 +163,18 @@ def _numbered(times: FloatArray, window: int, scale: float) -> NumberedPulses:
         # Without strays, and with the known steps, intervals tell more of the pitch.
         strays = np.sort(np.append(strays, times[~kept]))
         times, numbers = times[kept], numbers[kept]
+        kept = np.ones(times.size, np.bool_)
         if times.size < FEWEST:
             break
         intervals, steps = np.diff(times), np.maximum(np.diff(numbers), 1)
         pitch = _middle(np.maximum(intervals, 1e-300) / steps, 2 * window + 1)
         silent = intervals > _STANDSTILL * pitch
-        kept = np.ones(times.size, np.bool_)
     if times.size < FEWEST:
         numbers, places = np.arange(times.size), np.zeros(times.size)
         breaks = np.empty(0, np.int64)
     found = NumberedPulses(times, numbers, places, np.append(pitch[:1], pitch)[:times.size],
                            strays, breaks)
-    return found.only(kept[:times.size])
+    return found.only(kept)
 
 
 def _middle(intervals: FloatArray, window: int) -> FloatArray:

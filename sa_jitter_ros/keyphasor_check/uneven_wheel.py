@@ -36,7 +36,7 @@ _TOLERANCE = 0.25  # of an interval, by which teeth are uneven
 
 
 class _Numbers(TriggerCounter):
-    """Takes what a trigger counter takes and keeps times and numbers of the pulses."""
+    """Takes the pulses that a trigger counter takes, and keeps their times and numbers alone."""
 
     def __init__(self, marks: int) -> None:
         super().__init__(teeth=1, teeth_per_trigger=1)
@@ -47,7 +47,6 @@ class _Numbers(TriggerCounter):
 
     def begin(self, time: float, tooth: int, *, passed: int | None = None) -> None:
         """Begin a run; where the marks in front of it are not known, the count begins anew."""
-        super().begin(time, tooth, passed=passed)
         last = self.numbers[-1] if self.numbers else 0
         if self.numbers and passed is None:
             self.breaks.append(len(self.numbers))
@@ -57,7 +56,6 @@ class _Numbers(TriggerCounter):
 
     def extend(self, times: list[float], steps: list[int]) -> None:
         """Add pulses to the run."""
-        super().extend(times, steps)
         self.times += times
         self.numbers += (self.numbers[-1] + np.cumsum(steps)).tolist()
 

@@ -60,9 +60,8 @@ def recovered_jitter(averages: Sequence[Average]) -> Jitter | None:
         return None
     power, products, count = [], [], 0
     for item in good:
-        errors, known = item.pulse_errors, item.standard_errors
+        errors, noise = item.pulse_errors, float(np.mean(item.standard_errors**2))
         n = errors.size
-        noise = float(np.mean(known**2))
         # The mean of each average is not known.
         power.append((float(np.mean(errors**2)) - noise) * n / (n - 1.0))
         products.append(float(np.mean(errors[1:] * errors[:-1])) + power[-1] / n)

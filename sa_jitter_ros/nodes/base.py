@@ -12,8 +12,6 @@
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from itertools import pairwise
-from pathlib import Path
 import re
 import socket
 import sys
@@ -40,7 +38,7 @@ from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import first_of, Flow, Health, Level
 from sa_jitter_ros.nodes.lifetime import end_within, InterruptOnce, SECONDS
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.nodes.parameters import given_parameters, ParameterSet
+from sa_jitter_ros.nodes.parameters import given_parameters, parameter_files, ParameterSet
 from sa_jitter_ros.parameter_file import require_regular_file
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 
@@ -382,9 +380,9 @@ def _end(nodes: Sequence[MonitoringNode]) -> None:
 
 def _check_parameter_files(args: Sequence[str]) -> None:
     """Raise ParameterError for a file that rcl would read for ever."""
-    for name in (name for option, name in pairwise(args) if option == '--params-file'):
+    for name in parameter_files(args):
         try:
-            require_regular_file(Path(name))
+            require_regular_file(name)
         except ParameterError as error:
             raise ParameterError(f'{name}: {error}') from None
         except OSError:

@@ -205,8 +205,7 @@ class MachineSimulator(PlaybackNode):
             if high > low:
                 waveform = (SampleBlock(machine.tach_waveform(low, high)[None],
                                         origin + low / tach_rate, tach_rate, low),)
-        pulses = (machine.pulses(start / rate, stop / rate).times if self._pulses
-                  else np.empty(0))
+        pulses = machine.pulses(start / rate, stop / rate).times if self._pulses else np.empty(0)
         return Portion((stop - start) / rate, (vibration,), waveform, origin + pulses)
 
     def progress(self, sent: float) -> str:

@@ -54,10 +54,7 @@ SAMPLE_TYPES: dict[str, type] = {
     FLOAT32: Float32MultiArray,
     IMU: Imu,
 }
-PULSE_TYPES: dict[str, type] = {
-    TIME_REFERENCE: TimeReference,
-    FLOAT64: Float64MultiArray,
-}
+PULSE_TYPES: dict[str, type] = {TIME_REFERENCE: TimeReference, FLOAT64: Float64MultiArray}
 
 
 @dataclass(frozen=True)

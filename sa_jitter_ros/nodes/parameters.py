@@ -116,6 +116,11 @@ def common_name(args: Sequence[str]) -> tuple[list[str], str]:
     return kept, name
 
 
+def parameter_files(args: Sequence[str]) -> list[Path]:
+    """Return the parameter files of a command line."""
+    return [Path(path) for option, path in pairwise(args) if option == '--params-file']
+
+
 def given_parameters(node: str, args: Sequence[str], process: Sequence[str] = ()
                      ) -> list[rclpy.parameter.Parameter]:
     """
@@ -124,7 +129,7 @@ def given_parameters(node: str, args: Sequence[str], process: Sequence[str] = ()
     rcl lets the section of a node in a file win over `-p` for all nodes, and knows neither the
     section of a renamed node nor those of the names of its `process`. Without files rcl does all.
     """
-    files = [Path(path) for option, path in pairwise(args) if option == '--params-file']
+    files = parameter_files(args)
     rules = [_RULE.fullmatch(rule) for option, rule in pairwise(args)
              if option in ('-r', '--remap')]
     name = next((rule[2] for rule in rules if rule and rule[1] in (None, node)), node)

@@ -19,8 +19,10 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
+from sa_jitter_ros.nodes.parameters import parameter_files
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import fixed, Parameter
 from sa_jitter_ros.recordings import read, Recording
@@ -68,13 +70,14 @@ class RecordingPlayer(PlaybackNode):
         for remark in in_units(recording, channels).remarks:
             self.warn(remark)
         recording, remarks = usable_channels(recording)
+        for path in parameter_files(node_kwargs.get('cli_args') or sys.argv):
+            recording = on_target(recording, path)
         self._recording = recording
         self._pulse_times, self._with_waveform = keyphasor_of(recording, values['tach'])
         for remark in (*remarks, *doubts(
                 recording, self._pulse_times, orders=recording.orders, ratio=recording.ratio,
                 pulses_per_revolution=recording.pulses_per_revolution,
-                pulses_per_trigger=recording.pulses_per_trigger,
-                missing_teeth=recording.missing_teeth)):
+                pulses_per_trigger=recording.pulses_per_trigger, **recording.target)):
             self.warn(remark)
         if self._pulse_times is not None and values['keyphasor_rate'] > 0.0:
             self._pulse_times = (np.ceil(self._pulse_times * values['keyphasor_rate'])

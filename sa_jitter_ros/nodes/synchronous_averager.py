@@ -60,8 +60,7 @@ class SynchronousAverager(MonitoringNode):
                             labels=lambda count: self._samples.scale.labels)
         self._shafts = {name: ShaftOutput(self, name, limits) for name in names}
         self._latest = {name: deque[Average](maxlen=_LATEST) for name in names}
-        self._averager = streaming_averager(
-            values, buffer_seconds=values['buffer_seconds'])
+        self._averager = streaming_averager(values, buffer_seconds=values['buffer_seconds'])
         self._check(values)
         self._apply_indicators(values)
         self._values = values

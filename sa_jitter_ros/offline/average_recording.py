@@ -148,9 +148,8 @@ class RecordingAverager:
         """Return what contradicts each other in recording, settings and averages of the shafts."""
         rate = self._values['keyphasor_rate']
         target = {name: self._values[name] for name in (
-            'pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth', *(
-                ('target_geometry', 'target_angles')
-                if self._values['target_geometry'] == 'given' else ()))}
+            'pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth', 'target_geometry',
+            'target_angles')}
         found = list(doubts(
             self._recording, self.pulses, **target,
             jitter_std=1.0 / math.sqrt(12.0) / rate

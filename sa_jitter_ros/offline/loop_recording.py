@@ -11,7 +11,7 @@
 """One recording: its loop closed, by a function of a job that any process can do."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 import json
 import math
 from pathlib import Path
@@ -20,10 +20,10 @@ import warnings
 
 from sa_jitter_ros.errors import DataWarning, one_line, SaJitterError
 from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, row_values
-from sa_jitter_ros.offline.settings import target_of
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.tacholess.recording import Tacholess
@@ -57,21 +57,11 @@ class LoopRow(RecordingRow):
 def with_pulses(recording: Recording, params: Path, tacholess: Tacholess | None) -> Recording:
     """Return a recording whose pulses are found in the vibration, if that is asked."""
     if tacholess is None:
-        return on_target(recording, params)
+        return recording
     machine = Machine.among(read_parameters(params, 'jitter_predictor'))
     found, _ = tacholess.pulses_of(on_target(recording, params), machine)
     warnings.warn(found.remarks[-1], DataWarning, stacklevel=2)
     return found
-
-
-def on_target(recording: Recording, params: Path) -> Recording:
-    """Return a recording with the uneven target that the machine file gives to the averager."""
-    target = target_of(params)
-    angles = tuple(target.pop('target_angles', ()))
-    if target.pop('target_geometry', 'none') == 'given':
-        recording = replace(recording, target_angles=angles)
-    return recording if recording.missing_teeth or not target.get('missing_teeth') else replace(
-        recording, **target)
 
 
 def loop_file(job: LoopJob) -> LoopRow:

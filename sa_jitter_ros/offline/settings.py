@@ -113,12 +113,6 @@ def section(params: Path | None, node: str) -> dict[str, Any]:
         return {}
 
 
-def target_of(params: Path) -> Values:
-    """Return what a machine file says of the target to the averager; raises ParameterError."""
-    return converted(section(params, AVERAGER), {name: _PARAMETERS[name] for name in (
-        'pulses_per_revolution', 'missing_teeth', 'target_geometry', 'target_angles')})
-
-
 def _specifications(values: Mapping[str, Any]) -> dict[str, Parameter]:
     """Return the averager's parameters by name, with those of the shafts in `values`."""
     shafts = _SHAFTS.convert(values.get('shafts', _SHAFTS.default))
