@@ -95,6 +95,8 @@ class LooseMarks:
     def _look(self) -> None:
         """Count the pulses of the mark of which most are beside their place."""
         off = np.array(self._off)
+        if off.max() <= _BESIDE:  # as it is below every limit
+            return
         usual = np.maximum(np.quantile(off, _QUANTILE), np.quantile(off, _QUANTILE, axis=(1, 2)))
         limit = np.maximum(_BESIDE, _USUAL * usual)
         # A fit to a speed that bends, or to displaced pulses, is bad as a whole and tells nothing.
