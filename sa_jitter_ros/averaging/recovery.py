@@ -286,7 +286,7 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         if search is not None:
             strongest, clearest = search.strongest(errors, most, below=reach)
             clear = np.union1d(clear, clearest)
-            candidates = np.append(strongest, np.setdiff1d(candidates, strongest))
+            candidates = np.append(candidates, strongest[~np.isin(strongest, listed)])
             if clearest.size:
                 candidates = candidates[search.plausible(
                     errors, candidates, cycles=len(grid.cycles))]
@@ -295,9 +295,12 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         leaking = not _whole(np.append(candidates, listed) * cycle_length)
         if leaking:
             candidates = np.append(candidates, np.setdiff1d(listed, candidates))
+        # Others than these are not worth more unknowns than half the samples of a cycle.
+        room = np.where(np.isin(candidates, (*listed, *clear)), _MOST_COLUMNS,
+                        len(grid.samples) // 2)
         columns = np.cumsum([2 * nodes_for(g * spread) for g in candidates])
         model = compress(grid, cycle_length=cycle_length, first_angle=first_angle, spread=spread,
-                         orders=np.sort(candidates[columns <= _MOST_COLUMNS]))
+                         orders=np.sort(candidates[columns <= room]))
         significant = significant_orders(model, errors, tests=len(known), least=rounding)
         found = np.flatnonzero(significant.any(axis=1) & (model.orders <= reach))
         chosen = found[model.orders[found] * width <= _SAFE_TURNS]
