@@ -126,6 +126,41 @@ def test_values_that_alternate_have_no_memory_and_those_of_a_walk_the_largest(rn
     assert memory_of(rng.standard_normal((200, 30)).cumsum(axis=0)) == 0.95
 
 
+def give(test, values, doubt=np.nan):
+    """Give values (number, unit, quantity) to a test, each of this doubt."""
+    unknown = np.full(test.shape, np.nan)
+    for number, value in enumerate(values):
+        test.update(0, value, unknown, np.full(test.shape, doubt), (number, number), 1e4)
+
+
+def test_what_came_before_a_change_is_no_part_of_what_comes_behind_it(rng):
+    """Its first values neither correlate nor scatter with those that follow."""
+    test = ChangeTest((1, 2), learning=20)
+    give(test, rng.standard_normal((100, 1, 2)))
+    for _ in range(10):
+        if not test.active.any():
+            give(test, np.array([[[6.0, 0.1]]]))
+    assert test.active.tolist() == [[True, False]]
+    state = test.state()
+    for parts in (state['gone'], state['delayed'][:, 0], state['filled'],
+                  state['blocks'][:, 0]):
+        assert not parts[..., 0, 0].any()
+    assert state['filled'][..., 0, 1].all()
+    assert state['delayed'][:, 0, 0, 1].all()
+
+
+def test_doubt_that_grows_is_no_correlation(rng):
+    draw = smooth(rng, (1, 3), 0.6)
+    values = np.array([draw() for _ in range(250)])
+    found = []
+    for doubt in (0.01, 2.0):
+        test = ChangeTest((1, 3), learning=20)
+        give(test, values[:100], 0.01)
+        give(test, values[100:], doubt)
+        found.append(test.correlation())
+    np.testing.assert_allclose(*found, atol=0.05)
+
+
 def scored(values):
     """Return the score of the last value (count, unit) of each unit, that learns those before."""
     place, none = SpeedBin((values.shape[1], 1)), np.zeros((values.shape[1], 1))

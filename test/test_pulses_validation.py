@@ -351,6 +351,17 @@ def test_a_lost_tooth_is_bridged():
     assert (len(runs), counts.missing_bridged) == (1, 1)
 
 
+def test_a_shaft_behind_long_noise_is_found_as_soon_as_one_behind_short_noise(rng):
+    waited = []
+    for count in (100, 1500):
+        validator = PulseValidator()
+        noise = np.cumsum(rng.exponential(0.05, count))
+        validator.update(noise)
+        found = validator.update(noise[-1] + 0.1 * np.arange(1, 401))
+        waited.append(float(found.times[0]) - noise[-1] if found.times.size else np.inf)
+    assert max(waited) < 15.0
+
+
 def test_noise_on_a_wheel_gives_no_wrong_cycle(rng):
     clean = wheel(200, gaps=[34, 35], teeth=36)
     noise = rng.uniform(1.0, 11.0, 40)
