@@ -234,9 +234,10 @@ def test_a_likely_mistake_is_named(pulses, text):
 
 
 def test_milliseconds_slightly_too_long_are_likelier_than_indices_that_end_early():
-    pulses = np.linspace(0.0, 1.05e3 * PULSES[-1], 50)
+    rate = 1900.0
+    pulses = np.linspace(0.0, 1.05e3 * TIME.size / rate, 50)
     with pytest.raises(sa.SignalError, match='look like milliseconds'):
-        sa.average(VIBRATION, 0.95 * RATE, pulses)
+        sa.average(VIBRATION, rate, pulses)
 
 
 def test_a_likely_mistake_is_named_beside_an_average():

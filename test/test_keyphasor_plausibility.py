@@ -159,15 +159,6 @@ def test_noise_alone_is_seldom_taken_for_an_order(rng):
     assert missed <= 1
 
 
-def test_some_of_many_orders_stand_in_noise_by_chance(rng):
-    time = np.arange(20_000) / 2e3
-    orders = tuple(range(2, 42))
-    for _ in range(5):
-        noise = Recording(ArraySource(rng.normal(size=(1, time.size))), 2e3)
-        found, = doubts(noise, np.arange(200) / 20.0, orders=orders)
-        assert 'stands above its noise' in found
-
-
 @pytest.mark.parametrize(('strong', 'weak', 'marks', 'declared'), [
     ((8, 16, 24), (1, 2, 3), 1, 8), ((1, 2, 3), (8, 16, 24), 8, 1)])
 def test_marks_of_an_eighth_or_eight_times_as_many_are_named(rng, strong, weak, marks, declared):

@@ -351,10 +351,10 @@ def test_a_lost_tooth_is_bridged():
     assert (len(runs), counts.missing_bridged) == (1, 1)
 
 
-def test_a_shaft_behind_long_noise_is_found_as_soon_as_one_behind_short_noise(rng):
+def test_a_shaft_behind_long_noise_is_found_as_soon_as_one_behind_short_noise():
     waited = []
     for count in (100, 1500):
-        validator = PulseValidator()
+        validator, rng = PulseValidator(), np.random.default_rng(1)
         noise = np.cumsum(rng.exponential(0.05, count))
         validator.update(noise)
         found = validator.update(noise[-1] + 0.1 * np.arange(1, 401))
