@@ -124,6 +124,9 @@ def test_slow_unsteadiness_below_the_noise_is_learnt():
 def test_values_that_alternate_have_no_memory_and_those_of_a_walk_the_largest(rng):
     assert memory_of(np.tile([[1.0], [-1.0]], (50, 1))) == 0.0
     assert memory_of(rng.standard_normal((200, 30)).cumsum(axis=0)) == 0.95
+    noise = rng.standard_normal((20, 400))
+    noise[8:, ::2] = np.nan
+    assert memory_of(noise) == pytest.approx(0.0, abs=0.1)
 
 
 def give(test, values, doubt=np.nan):
@@ -601,6 +604,16 @@ def test_damaged_file_is_refused_in_one_line_and_kept(kept, kind):
     assert 'move it away to learn again' in str(refused.value)
     assert '\n' not in str(refused.value)
     assert path.read_bytes() == before
+
+
+def test_file_that_unpacks_to_gigabytes_is_not_read(kept):
+    path = kept[2]
+    content = bytearray(path.read_bytes())
+    place = content.index(b'PK\x01\x02') + 24  # where the list of contents has the first size
+    content[place:place + 4] = (1 << 30).to_bytes(4, 'little')
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match='bytes, at most'):
+        read_baseline(path, 'pump 3', SETTINGS, 1.0)
 
 
 def test_every_cut_and_flipped_byte_is_noticed(kept):
