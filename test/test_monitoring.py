@@ -164,6 +164,20 @@ def test_doubt_that_grows_is_no_correlation(rng):
     np.testing.assert_allclose(*found, atol=0.05)
 
 
+def test_noise_that_doubles_widens_the_scatter_within_some_tens_of_values():
+    place, ones, none = SpeedBin((1, 1)), np.ones((1, 1)), np.zeros((1, 1), np.bool_)
+    found = []
+    for number in range(150):
+        value = ones * (-1.0) ** number
+        noise = 0.5 * ones if number < 100 else ones
+        scores, weights = place.score(value, noise, ones, ones)
+        place.learn(value, noise, ones, weights, none | (number >= 100))
+        found.append(abs(float(scores[0, 0, 0])))
+    # the variance of 1 has 0.5 more
+    assert np.mean(found[90:100]) > 0.95
+    assert np.mean(found[140:]) == pytest.approx(np.sqrt(1.0 / 1.5), abs=0.03)
+
+
 def scored(values):
     """Return the score of the last value (count, unit) of each unit, that learns those before."""
     place, none = SpeedBin((values.shape[1], 1)), np.zeros((values.shape[1], 1))
