@@ -176,6 +176,9 @@ def test_noise_that_doubles_widens_the_scatter_within_some_tens_of_values():
     # the variance of 1 has 0.5 more
     assert np.mean(found[90:100]) > 0.95
     assert np.mean(found[140:]) == pytest.approx(np.sqrt(1.0 / 1.5), abs=0.03)
+    # much more noise does so at once
+    scores, _ = place.score(ones, 5.0 * ones, ones, ones)
+    assert scores[0, 0, 0] == pytest.approx(np.sqrt(1.0 / 5.5), abs=0.03)
 
 
 def scored(values):
