@@ -233,6 +233,13 @@ def test_a_likely_mistake_is_named(pulses, text):
         sa.average(VIBRATION, RATE, pulses)
 
 
+def test_milliseconds_slightly_too_long_are_likelier_than_indices_that_end_early():
+    rate = 1900.0
+    pulses = np.linspace(0.0, 1.05e3 * TIME.size / rate, 50)
+    with pytest.raises(sa.SignalError, match='look like milliseconds'):
+        sa.average(VIBRATION, rate, pulses)
+
+
 def test_a_likely_mistake_is_named_beside_an_average():
     with pytest.warns(sa.DataWarning, match='span 400 s, the vibration spans 2 s'):
         sa.average(VIBRATION, RATE, np.arange(0.0, 400.5, 0.5))

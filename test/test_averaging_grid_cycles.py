@@ -13,6 +13,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
+from sa_jitter_ros.averaging.synchronous_orders import LineSearch
 
 
 @pytest.mark.parametrize(('samples', 'orders', 'fewer'), [
@@ -34,3 +35,13 @@ def test_cycles_are_not_compact_where_that_leaves_less_than_their_columns(rng):
     grid = GridCycles(rng.standard_normal((6, 864, 1)))
     assert [len(grid.compact(rng.standard_normal((864, columns)), 6.0)[0]) == 864
             for columns in (10, 119)] == [False, True]
+
+
+@pytest.mark.parametrize('order', [10.0, 10.4])
+def test_what_an_order_shows_of_a_line_is_known(order):
+    angle = np.arange(12)[:, None] + np.arange(128) / 128
+    grid = GridCycles(np.cos(2.0 * np.pi * order * angle)[..., None])
+    search, none = LineSearch.of(grid, 1.0), np.zeros(grid.pulses)
+    orders = np.array([order, 8.0, 9.0, 11.0, 12.0, 13.0])
+    lines = search._series(none, orders).sum(axis=1)[:, 0]
+    np.testing.assert_allclose(search._shown(none, orders)[:, 0], lines / lines[0], atol=1e-4)

@@ -105,6 +105,18 @@ def test_few_samples_and_parts_of_a_revolution_are_enough(seed):
     assert np.mean((late / found.standard_errors) ** 2) < 1.7
 
 
+def test_pulses_whose_errors_leave_the_phase_open_are_not_resolved():
+    """The first and the last pulse bound one cycle, which shows less of them than two."""
+    rng = np.random.default_rng(3)
+    cycles, pulses = simulate(rng, jitter(rng, 0.8), {19: [1.0]}, noise=11.0)
+    found = recover(cycles, pulses, declared=declared(0.8), orders=[19.0])
+    assert found.accepted
+    turn = 2.0 * np.pi * 19.0 * SPEED * found.standard_errors  # rad, of order 19
+    assert turn[[0, -1]].min() > 1.1 > 0.9 > turn[1:-1].max()
+    assert found.resolved[1:-1].all()
+    assert not found.resolved[[0, -1]].any()
+
+
 @pytest.mark.parametrize(('width', 'snr_db'), [(0.2, 10), (0.4, 10), (0.4, 0), (0.8, 10)])
 def test_gear_mesh_is_restored_at_the_widths_that_hide_it(rng, width, snr_db):
     errors = jitter(rng, width)

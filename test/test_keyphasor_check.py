@@ -17,19 +17,21 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import RecordingError, SignalError
+from sa_jitter_ros.keyphasor_check import check as check_module
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.clock import find_clock
 from sa_jitter_ros.keyphasor_check.costs import _of_speed
-from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
+from sa_jitter_ros.keyphasor_check.jitter import Jitter, measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
-    _per_line, marks_evidence, on_orders, ToothLines)
+    _per_line, find_lines, marks_evidence, on_orders, ToothLines)
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
 from sa_jitter_ros.keyphasor_check.vibration import recovered_jitter
-from sa_jitter_ros.keyphasor_check.wheel import patterns
+from sa_jitter_ros.keyphasor_check.wheel import _missing, patterns
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from scipy.signal import lfilter
 
 RATE, SPEED, SECONDS = 6000.0, 25.0, 8.0
 ORDERS = ((1.0, 0.3), (19.0, 1.0), (20.0, 0.2), (38.0, 0.5))
@@ -465,6 +467,31 @@ def test_a_line_that_falls_anywhere_says_nothing_for_a_shaft(rng):
         on = on_orders(lines, ratio)[1].mean()
         said = np.exp(_per_line(lines, ratio))
         assert on * said + (1.0 - on) * 0.3 == pytest.approx(1.0, abs=0.05)
+
+
+def test_jitter_that_the_pulses_hide_is_told_in_us(rng, monkeypatch):
+    monkeypatch.setattr(check_module, 'recovered_jitter', lambda _: Jitter(3e-5, 1e-6, 0.9, 0.02))
+    numbers = np.arange(2000)
+    fitted = SimpleNamespace(true=numbers / 25.0 + rng.normal(0.0, 1e-5, 2000), numbers=numbers)
+    found = check_module._Check._jitter(None, fitted, (), '')['jitter_std']
+    assert found.value == 3e-5
+    alone = found.decided_by.split('the pulses alone show ')[1].split(' us')[0]
+    assert float(alone) == pytest.approx(10.0, rel=0.1)
+
+
+@pytest.mark.parametrize(('frequency', 'width'), [(700.0, 16.0), (300.0, 8.0)])
+def test_noise_in_a_resonance_is_no_line(rng, frequency, width):
+    pole = np.exp(2.0 * np.pi / RATE * (1j * frequency - 0.5 * width))
+    noise = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.normal(size=120_000))
+    noise += 0.02 * noise.std() * rng.normal(size=noise.size)
+    pulses = np.arange(1, 399) / 20.0
+    assert find_lines(noise[:, None], 0.0, RATE, pulses, 20.0 * pulses).places.size == 0
+
+
+def test_a_tooth_without_a_pulse_is_missing_unless_most_pulses_are_lost():
+    span = np.full(4, 100)
+    assert _missing(np.array([90, 90, 90, 0]), span).tolist() == [False, False, False, True]
+    assert not _missing(np.array([50, 50, 50, 0]), span).any()
 
 
 def test_the_tach_shaft_with_orders_of_its_own_is_the_one_of_interest(rng):

@@ -180,6 +180,19 @@ def test_noise_alone_is_seldom_taken_for_an_order(rng):
     assert missed <= 1
 
 
+@pytest.mark.parametrize(('strong', 'weak', 'marks', 'declared'), [
+    ((8, 16, 24), (1, 2, 3), 1, 8), ((1, 2, 3), (8, 16, 24), 8, 1)])
+def test_marks_of_an_eighth_or_eight_times_as_many_are_named(rng, strong, weak, marks, declared):
+    time = np.arange(int(RATE * SECONDS)) / RATE
+    lines = [(order, 1.0) for order in strong] + [(order, 0.05) for order in weak]
+    samples = rng.normal(0.0, 0.01, time.size) + sum(
+        size * np.cos(40.0 * np.pi * order * time + order) for order, size in lines)
+    pulses = np.arange(1, int(20 * SECONDS * marks)) / (20.0 * marks)
+    found, = doubts(Recording(ArraySource(samples[None]), RATE), pulses, orders=strong,
+                    pulses_per_revolution=declared)
+    assert f'pulses_per_revolution {marks} instead of {declared} they are far larger' in found
+
+
 def test_bad_channels_are_left_out_and_named(recording):
     found, remarks = usable_channels(with_bad_channels(recording))
     assert found.channel_names == ('bearing', 'clipped')

@@ -124,6 +124,61 @@ def test_slow_unsteadiness_below_the_noise_is_learnt():
 def test_values_that_alternate_have_no_memory_and_those_of_a_walk_the_largest(rng):
     assert memory_of(np.tile([[1.0], [-1.0]], (50, 1))) == 0.0
     assert memory_of(rng.standard_normal((200, 30)).cumsum(axis=0)) == 0.95
+    noise = rng.standard_normal((20, 400))
+    noise[8:, ::2] = np.nan
+    assert memory_of(noise) == pytest.approx(0.0, abs=0.1)
+
+
+def give(test, values, doubt=np.nan):
+    """Give values (number, unit, quantity) to a test, each of this doubt."""
+    unknown = np.full(test.shape, np.nan)
+    for number, value in enumerate(values):
+        test.update(0, value, unknown, np.full(test.shape, doubt), (number, number), 1e4)
+
+
+def test_what_came_before_a_change_is_no_part_of_what_comes_behind_it(rng):
+    """Its first values neither correlate nor scatter with those that follow."""
+    test = ChangeTest((1, 2), learning=20)
+    give(test, rng.standard_normal((100, 1, 2)))
+    for _ in range(10):
+        if not test.active.any():
+            give(test, np.array([[[6.0, 0.1]]]))
+    assert test.active.tolist() == [[True, False]]
+    state = test.state()
+    for parts in (state['gone'], state['delayed'][:, 0], state['filled'],
+                  state['blocks'][:, 0]):
+        assert not parts[..., 0, 0].any()
+    assert state['filled'][..., 0, 1].all()
+    assert state['delayed'][:, 0, 0, 1].all()
+
+
+def test_doubt_that_grows_is_no_correlation(rng):
+    draw = smooth(rng, (1, 3), 0.6)
+    values = np.array([draw() for _ in range(250)])
+    found = []
+    for doubt in (0.01, 2.0):
+        test = ChangeTest((1, 3), learning=20)
+        give(test, values[:100], 0.01)
+        give(test, values[100:], doubt)
+        found.append(test.correlation())
+    np.testing.assert_allclose(*found, atol=0.05)
+
+
+def test_noise_that_doubles_widens_the_scatter_within_some_tens_of_values():
+    place, ones, none = SpeedBin((1, 1)), np.ones((1, 1)), np.zeros((1, 1), np.bool_)
+    found = []
+    for number in range(150):
+        value = ones * (-1.0) ** number
+        noise = 0.5 * ones if number < 100 else ones
+        scores, weights = place.score(value, noise, ones, ones)
+        place.learn(value, noise, ones, weights, none | (number >= 100))
+        found.append(abs(float(scores[0, 0, 0])))
+    # the variance of 1 has 0.5 more
+    assert np.mean(found[90:100]) > 0.95
+    assert np.mean(found[140:]) == pytest.approx(np.sqrt(1.0 / 1.5), abs=0.03)
+    # much more noise does so at once
+    scores, _ = place.score(ones, 5.0 * ones, ones, ones)
+    assert scores[0, 0, 0] == pytest.approx(np.sqrt(1.0 / 5.5), abs=0.03)
 
 
 def scored(values):
@@ -566,6 +621,16 @@ def test_damaged_file_is_refused_in_one_line_and_kept(kept, kind):
     assert 'move it away to learn again' in str(refused.value)
     assert '\n' not in str(refused.value)
     assert path.read_bytes() == before
+
+
+def test_file_that_unpacks_to_gigabytes_is_not_read(kept):
+    path = kept[2]
+    content = bytearray(path.read_bytes())
+    place = content.index(b'PK\x01\x02') + 24  # where the list of contents has the first size
+    content[place:place + 4] = (1 << 30).to_bytes(4, 'little')
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match='bytes, at most'):
+        read_baseline(path, 'pump 3', SETTINGS, 1.0)
 
 
 def test_every_cut_and_flipped_byte_is_noticed(kept):

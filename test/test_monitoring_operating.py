@@ -132,6 +132,18 @@ def test_an_average_has_the_mean_state_of_its_time():
     assert state.of('a', header(0.0, 9.5)) == 7.0
 
 
+def test_the_states_of_long_ago_are_forgotten(monkeypatch):
+    monkeypatch.setattr(operating, '_MOST_VALUES', 10)
+    state = OperatingState(stamped=True)
+    sizes = []
+    for number in range(100):
+        state.add(float(number), float(number))
+        sizes.append(len(state._times))
+    assert max(sizes) <= 20
+    assert state.of('a', header(90.0, 99.0)) == 94.5
+    assert math.isnan(state.of('a', header(0.0, 50.0)))
+
+
 def test_a_state_without_times_counts_as_it_comes(monkeypatch):
     clock = type('Clock', (), {'now': 100.0, 'monotonic': lambda self: self.now})()
     monkeypatch.setattr(operating, 'time', clock)

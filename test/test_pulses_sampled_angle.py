@@ -77,6 +77,12 @@ def test_any_cut_gives_the_same_pulses(lengths, seed):
                                AngleCrossings(marks=2).update(time, angle), rtol=0, atol=1e-12)
 
 
+def test_a_run_of_few_samples_has_the_pulses_of_its_marks_only():
+    crossings = AngleCrossings()
+    assert crossings.update([0.0, 0.01, 0.02], [1.0, 4.0, 7.0]).size == 0
+    assert crossings.flush() == pytest.approx([0.01 * (TURN - 1.0) / 3.0])
+
+
 def test_stops_and_reversals_end_a_run_and_marks_keep_their_angle():
     time = np.arange(20_000) / RATE
     speed = np.where(time < 5, 20.0, np.where(time < 8, 0.0, np.where(
@@ -333,6 +339,19 @@ def test_a_count_that_is_wrong_by_one_for_a_sample_moves_no_pulse():
     pulses, state = counter_pulses(counts, sample_rate=RATE, pulses_per_revolution=100)
     np.testing.assert_array_equal(pulses, clean)
     assert state.glitches == 2
+
+
+@pytest.mark.parametrize('wrong', [1, -1])
+def test_a_wrong_count_in_the_last_sample_of_a_block_waits_for_the_next(wrong):
+    counts = np.arange(800) // 20
+    counts[333] += wrong
+    crossings = AngleCrossings(marks=10, turn=10.0, counted=True,
+                               runs=counter_runs(counts.astype(float), 10.0))
+    found = [crossings.update(TIME[block], counts[block])
+             for block in (slice(0, 334), slice(334, 800))]
+    np.testing.assert_array_equal(
+        np.concatenate((*found, crossings.flush())), TIME[20:800:20])
+    assert crossings.state.glitches == 1
 
 
 def test_a_revolution_counter_of_a_bearing_rig(shared_data):

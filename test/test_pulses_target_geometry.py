@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
 from sa_jitter_ros.pulses.target_geometry import measured_geometry
-from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
+from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseValidator
 
 pytestmark = pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
@@ -317,3 +318,20 @@ def test_a_gap_among_the_first_revolutions_costs_no_later_pulse(rng, first):
     counts = validator.finish()
     assert counts.accepted + counts.unlocked == times.size  # none behind the start
     assert counts.doubles == 0
+
+
+def test_given_angles_are_found_in_far_fewer_revolutions_than_unknown_ones_are_learnt():
+    late = np.array([0.02, 0.0, -0.02])  # rad, at 100 Hz
+    waited = []
+    for given in (late.tolist(), None):
+        counter = TriggerCounter(teeth=3, teeth_per_trigger=1)
+        corrector = MarkCorrector(counter, count=3, given=given, say=print)
+        numbers = np.arange(601)
+        times = numbers / 300.0 + late[numbers % 3] / (200.0 * np.pi)
+        corrector.begin(float(times[0]), 0)
+        turn = 0
+        while not corrector.take().times.size:
+            turn += 1
+            corrector.extend(times[3 * turn - 2:3 * turn + 1].tolist(), [1] * 3)
+        waited.append(turn)
+    assert waited[0] < 0.2 * waited[1]

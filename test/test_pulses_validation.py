@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.target import EvenTarget
+from sa_jitter_ros.pulses.target import EvenTarget, ToothedWheel
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings import read
@@ -349,6 +349,34 @@ def test_a_lost_tooth_is_bridged():
         times, pulses_per_revolution=36, missing_teeth=2, missing_pulses='bridge')
     assert found == pytest.approx(1.0 + np.arange(12) / 20.0, abs=1e-12)
     assert (len(runs), counts.missing_bridged) == (1, 1)
+
+
+def test_a_shaft_behind_long_noise_is_found_as_soon_as_one_behind_short_noise():
+    waited = []
+    for count in (100, 1500):
+        validator, rng = PulseValidator(), np.random.default_rng(1)
+        noise = np.cumsum(rng.exponential(0.05, count))
+        validator.update(noise)
+        found = validator.update(noise[-1] + 0.1 * np.arange(1, 401))
+        waited.append(float(found.times[0]) - noise[-1] if found.times.size else np.inf)
+    assert max(waited) < 15.0
+
+
+def test_a_tolerance_of_1_accepts_every_pulse(rng):
+    times = np.cumsum(rng.uniform(0.01, 0.2, 300))
+    found, runs, _, counts = validate(times, interval_tolerance=1.0)
+    np.testing.assert_array_equal(found, times)
+    assert (len(runs), counts.accepted) == (1, 300)
+    with pytest.raises(ParameterError, match='hides the gap'):
+        PulseValidator(interval_tolerance=1.0, pulses_per_revolution=36, missing_teeth=1)
+
+
+def test_only_teeth_beside_a_gap_may_stand_off_by_more_than_the_tolerance():
+    wheel = ToothedWheel(teeth=36, missing=1, tolerance=0.1)
+    times = np.delete(np.arange(72.0), [35, 71])
+    for tooth, fits in ((34, True), (0, True), (20, False)):
+        moved = times + 0.2 * (times % 36 == tooth)
+        assert (wheel.lock(moved[5:43], None) is not None) == fits
 
 
 def test_noise_on_a_wheel_gives_no_wrong_cycle(rng):
