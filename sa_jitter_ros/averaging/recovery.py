@@ -265,7 +265,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
     Fit low orders first, then higher ones as the errors become better known.
 
     Where orders leak into each other in a trigger cycle, those that are listed or significant are
-    fitted even if they tell nothing of the errors, which would follow what they leak.
+    fitted even if they tell nothing of the errors, which would follow what they leak. Orders that
+    are neither listed nor clear are not worth more unknowns than half the samples of a cycle.
 
     `declared` is the standard deviation of the errors that is likeliest beforehand, `expected`
     the one whose turns of the orders decide which are safe to use.
@@ -274,7 +275,6 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                         if 0.0 < g * cycle_length <= 0.5 * len(grid.samples)])
     search = None if len(orders) else LineSearch.of(grid, cycle_length, additional_orders)
     most = most_orders + sum(g != round(g) for g in set(additional_orders))
-    rounding = _ROUNDING * grid.size
     known = listed if search is None else search.orders
     width = _UNIFORM_WIDTH * expected  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
@@ -295,14 +295,13 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         leaking = not _whole(np.append(candidates, listed) * cycle_length)
         if leaking:
             candidates = np.append(candidates, np.setdiff1d(listed, candidates))
-        # Others than these are not worth more unknowns than half the samples of a cycle.
         room = np.where(np.isin(candidates, (*listed, *clear)), _MOST_COLUMNS,
                         len(grid.samples) // 2)
         columns = np.cumsum([2 * nodes_for(g * spread) for g in candidates])
         model = compress(grid, cycle_length=cycle_length, first_angle=first_angle, spread=spread,
                          orders=np.sort(candidates[columns <= room]))
-        significant = significant_orders(model, errors, tests=len(known), least=rounding)
-        found = np.flatnonzero(significant.any(axis=1) & (model.orders <= reach))
+        shown = significant_orders(model, errors, tests=len(known), least=_ROUNDING * grid.size)
+        found = np.flatnonzero(shown.any(axis=1) & (model.orders <= reach))
         chosen = found[model.orders[found] * width <= _SAFE_TURNS]
         if np.array_equal(model.orders[chosen], used):  # no further order is safe: try the next
             chosen = found[:len(chosen) + 1]
@@ -310,9 +309,9 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
             break
         first, used = problem is None, model.orders[chosen]
         fitted = chosen if not leaking else np.flatnonzero(
-            significant.any(axis=1) | np.isin(model.orders, listed))
+            shown.any(axis=1) | np.isin(model.orders, listed))
         problem = PulseErrorProblem(
-            model, fitted, np.isin(fitted, chosen)[:, None] & significant[fitted])
+            model, fitted, np.isin(fitted, chosen)[:, None] & shown[fitted])
         if first and used[-1] * width > _SAFE_TURNS:
             errors = problem.scan(width)
         fit = problem.solve(errors, declared=declared)
