@@ -76,7 +76,8 @@ class PulseFollower:
     """
     Follow the pulses of a target, the first of which is the first of the `queue`.
 
-    Those in the queue (s) that are decided about are taken away; the true ones go to the `sink`.
+    The `model` of the intervals is started by the `lock`. Those in the queue (s) that are decided
+    about are taken away; the true ones go to the `sink`.
     `confirmed` (s) is the latest of these. Once the match is `lost`, nothing is decided; of a
     `probe`, which has no trigger cycles to lose, it is lost wherever the number of passed teeth is
     not sure. `marks`, `levels` and `times` are those of the intervals since the pattern of the
@@ -96,6 +97,8 @@ class PulseFollower:
         self._learnt = 0  # times that the pattern was learnt
         self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
         self._alternates = False
+        model.start(math.log(lock.interval), scatter=lock.scatter, count=lock.known,
+                    intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
         # the latest pulses, dropped ones too
         self._recent = deque[float](maxlen=_AGREEING + 1)
         verdicts.counts['accepted'] += 1
