@@ -195,13 +195,6 @@ class PulseFollower:
 
     # --- doubtful pulses ---
 
-    def _rules(self) -> PathRules:
-        return PathRules(
-            self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
-            np.maximum(self._lock.believed, self._options.tolerance).tolist(),
-            self._options.maximum_missing, self._model.expected, self._model.predictions,
-            self._model.tick, self._model.degrees)
-
     def _decide(self, final: bool) -> bool:
         """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""
         queue, model = self._queue, self._model
@@ -218,7 +211,11 @@ class PulseFollower:
             return False
         if self._is_of_clock():
             return True
-        rules = self._rules()
+        steps, widths, _ = self._lock.lists
+        given = np.maximum(self._lock.believed, self._options.tolerance).tolist()
+        rules = PathRules(
+            steps, widths, model.scatter, given, self._options.maximum_missing, model.expected,
+            model.predictions, model.tick, model.degrees)
         paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent, using=model.chosen)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
             paths = rules.extend(paths, pulse)
