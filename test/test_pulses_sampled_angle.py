@@ -207,7 +207,7 @@ def machine(rng, kind):
         return lambda angle: AngleCrossings(), stamps, wrapped(turned, kind), turn, rate, 0.0
     size = {'reset each turn': turn, 'overflow of 8 bits': 256.0,
             'overflow of 16 bits': 65536.0}[kind]
-    return (lambda angle: AngleCrossings(turn=turn, runs=counter_runs(angle, turn)), time,
+    return (lambda angle: AngleCrossings(runs=counter_runs(angle, turn)), time,
             np.floor(turn * turned) % size, turn, rate, 1.0 / abs(turn * speed))
 
 

@@ -73,7 +73,7 @@ class AngleRuns:
                  registers: tuple[float, ...] = (), below: tuple[float, ...] = (0.0,),
                  counts: bool = False) -> None:
         self.glitches = self.jumps = self.gaps = 0
-        self._turn, self._quantum = turn, 1.0 if counts else 0.0
+        self.turn, self._quantum = turn, 1.0 if counts else 0.0
         self._moduli, self._registers, self._below = moduli, registers, below
         self._tick = 0.0  # the latest step of an angle that stands between its steps
         self._time, self._value = np.empty(0), np.empty(0)
@@ -112,16 +112,16 @@ class AngleRuns:
         for modulus in (*self._moduli, *self._registers):
             wrapped = (steps - modulus * np.rint(steps / modulus)) / spans
             new = _centre(wrapped)
-            better = new[1] < 0.5 * deviation - 1e-9 * self._turn
+            better = new[1] < 0.5 * deviation - 1e-9 * self.turn
             step, deviation = np.where(better, new, (step, deviation))
             each = np.where(better[:, None], wrapped, each)
         least = min((*self._moduli, *self._registers), default=np.inf)
         share = np.minimum(_SHARE * np.abs(step), _OF_MODULUS * least)
         size = np.abs(steps)
         quantum = np.min(np.where(size > 0.0, size, np.inf), axis=1)
-        few = np.any(size == 0.0, axis=1) & (quantum <= _TICK * min(self._turn, least))
+        few = np.any(size == 0.0, axis=1) & (quantum <= _TICK * min(self.turn, least))
         quantum = np.maximum(np.where(few, quantum, 0.0), self._quantum)
-        floor = np.maximum(_QUANTA * quantum, _LEAST * self._turn)
+        floor = np.maximum(_QUANTA * quantum, _LEAST * self.turn)
         tolerance = np.maximum(share, floor) + _DEVIATIONS * deviation
         near = np.abs(each - step[:, None]) <= tolerance[:, None]  # half of them at least
         return np.mean(each, axis=1, where=near), tolerance
@@ -220,7 +220,7 @@ class AngleRuns:
             tolerances.append(limit)
         speed = float(np.mean(speeds)) if speeds else steps.expected[i] / span[i]
         tolerance = min(tolerances, default=steps.limit[i] / span[i])
-        stands = max(map(abs, speeds), default=0.0) <= _LEAST * self._turn
+        stands = max(map(abs, speeds), default=0.0) <= _LEAST * self.turn
         follow = np.arange(i, min(i + 1 + 2 * _LONGEST, end))
         spans = np.cumsum(span[follow])
         expected = speed * spans
@@ -240,7 +240,7 @@ class AngleRuns:
         moved, further = abs(steps.taken[i]), (1.0 + _LONGEST) * tolerance
         if stands:
             tick, self._tick = self._tick, moved
-            further = max(_TICK * self._turn, _TICKS * tick)
+            further = max(_TICK * self.turn, _TICKS * tick)
         if abs(steps.taken[i] - speed * span[i]) <= further:  # as after a glitch that is not seen
             return i + 1
         if ends and end - i <= _LONGEST:
@@ -267,11 +267,11 @@ class AngleRuns:
         near = np.concatenate((steps.raw[max(i - _BLOCK, 1):i], steps.raw[i + 1:i + _BLOCK]))
         near = near[near != 0.0]
         for bits in BITS:
-            counts = round(2.0**bits * self._turn / jump)  # of a turn
+            counts = round(2.0**bits * self.turn / jump)  # of a turn
             if counts < 2:
                 continue
-            modulus = 2.0**bits * self._turn / counts
-            whole = near * counts / self._turn
+            modulus = 2.0**bits * self.turn / counts
+            whole = near * counts / self.turn
             if near.size >= _FEWEST and abs(modulus - jump) <= steps.limit[i] and (
                     np.mean(np.abs(whole - np.rint(whole)) < _ALIKE) > _NEARLY_ALL):
                 return float(modulus)

@@ -45,10 +45,10 @@ def clock_tick(intervals: FloatArray, latest: float) -> float:
     """
     rounding = _STAMP + 4.0 * float(np.spacing(abs(latest)))
     values = np.sort(intervals)
-    last = np.append(np.diff(values) > rounding, True)
-    if values.size < _FEWEST or np.count_nonzero(last) > _DIFFERENT * values.size:
+    differ = np.diff(values) > rounding
+    if values.size < _FEWEST or np.count_nonzero(differ) + 1 > _DIFFERENT * values.size:
         return 0.0
-    values = values[last]
+    values = values[np.append(differ, True)]
     steps = np.diff(values)
     if not steps.size:
         return 0.0

@@ -52,7 +52,6 @@ _WINDOW = 64  # intervals that show the tick of a clock
 # as much again by half for the jitter of the shaft. Widths of marks are known to a tick.
 _TICKS = tuple(0.75 * sum(abs(second - first) for first, second in pairwise(
     (0.0, 1.0, *(-item for item in reversed(weights)), 0.0))) for weights in _WEIGHTS)
-_OF_MARKS = 1.0
 # Fractions of a trigger cycle: smallest tolerance, displacement that no average shows, distance of
 # two pulses of one mark. A pulse further off its expected time waits for the next one, which tells
 # if it was a stray; the nearer one of two is the pulse.
@@ -84,7 +83,7 @@ class IntervalModel:
     def __init__(self, *, given: float, pulses_per_trigger: int, block: int, marks: int = 1
                  ) -> None:
         self.given, self.block = given, block
-        self._window, self._of_marks = max(_WINDOW, 3 * marks), _OF_MARKS * (marks > 1)
+        self._window, self._of_marks = max(_WINDOW, 3 * marks), float(marks > 1)
         self._floor = min(_FLOOR * pulses_per_trigger, 0.03)
         self._harmless, self._same = (
             min(share * pulses_per_trigger, 0.1) for share in (_HARMLESS, _SAME))
@@ -129,11 +128,6 @@ class IntervalModel:
     def has_tick(self) -> bool:
         """Whether the latest intervals are multiples of the tick of a clock."""
         return bool(self.tick or clock_tick(np.array(self._intervals), 0.0))
-
-    @property
-    def known(self) -> int:
-        """Return the number of intervals from which the scatter is known."""
-        return int(self.degrees)
 
     @property
     def level(self) -> float:

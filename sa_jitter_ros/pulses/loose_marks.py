@@ -18,6 +18,9 @@ than most, and by these alone the marks differ.
 """
 
 from collections import deque
+from itertools import pairwise
+from operator import add
+from statistics import median
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
@@ -68,21 +71,22 @@ class LooseMarks:
         """Take the next pulses (s)."""
         self._pulses += pulses if self._few else []
         while len(self._pulses) > self._size + 1:
-            times = np.array(self._pulses[:self._size + 2])  # one on either side is not fitted
+            times = self._pulses[:self._size + 2]  # one on either side is not fitted
             del self._pulses[:self._size]
-            intervals = np.diff(times)
-            usual = float(np.median(intervals))
-            if not intervals.min() > _LEAST * usual > _LEAST**2 * intervals.max():
+            intervals = [after - before for before, after in pairwise(times)]
+            usual, longest = median(intervals), max(intervals)
+            if not min(intervals) > _LEAST * usual > _LEAST**2 * longest:
                 continue  # out of order, or across a standstill
-            steps = np.maximum(np.floor(intervals / usual + _LONGER), 1.0).astype(int)
-            shortest = float(np.min(times[2:] - times[:-2]))
-            if steps.max() == 1 and shortest > (1.0 + _LONGER) * usual:
-                off = np.abs(self._deviations((times[1:-1] - times[1]) / usual))
+            passed = self._size
+            if longest >= (2.0 - _LONGER) * usual:
+                passed = sum(max(int(each / usual + _LONGER), 1) for each in intervals[1:])
+            elif min(map(add, intervals, intervals[1:])) > (1.0 + _LONGER) * usual:
+                off = np.abs(self._deviations((np.array(times[1:-1]) - times[1]) / usual))
                 if off.max() < _LOST:
-                    off -= _TICKS * clock_tick(intervals, float(times[-1])) / usual
+                    off -= _TICKS * clock_tick(np.array(intervals), times[-1]) / usual
                     self._off.append(np.roll(off.reshape(_TURNS, -1), self._first, axis=1))
                     self._look()
-            self._first = (self._first + int(steps[1:].sum())) % self._marks
+            self._first = (self._first + passed) % self._marks
 
     def _deviations(self, place: FloatArray) -> FloatArray:
         """Return how far pulses (n,) at these places are off, in intervals."""

@@ -79,7 +79,8 @@ def mark_pattern(marks: IntArray, levels: FloatArray, count: int, *,
     if not known_marks.any():
         return None
     widths = np.zeros(count)
-    widths[known_marks] = np.nanmedian(table[:, known_marks], axis=0)
+    ordered, column = np.sort(table, axis=0), np.flatnonzero(known_marks)  # NaN last
+    widths[column] = 0.5 * sum(ordered[(seen[column] - k) // 2, column] for k in (0, 1))
     deviations = (table - widths) * np.sqrt(seen / np.maximum(seen - 1.0, 1.0))
     every = deviations[:, known_marks]
     every = every[np.isfinite(every)]

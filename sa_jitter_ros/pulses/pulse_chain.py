@@ -60,9 +60,9 @@ class Chain:
     @property
     def scatter(self) -> float:
         """Robust scatter of the levels about the better of two predictions."""
-        squares = [item**2 for order in (1, 2)
-                   if (item := _finite(np.diff(self.levels, order))).size]
-        return math.sqrt(min(map(_mean_square, squares))) if squares else _PRIOR
+        changes = [np.diff(self.levels, order) for order in (1, 2)]
+        squares = [item[np.isfinite(item)]**2 for item in changes]
+        return math.sqrt(min(map(_mean_square, filter(np.size, squares)), default=_PRIOR**2))
 
 
 def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRAY_OF_ONE
@@ -168,10 +168,6 @@ def robust_square(squares: FloatArray) -> FloatArray:
     # Where most deviations are 0, as those of a slow clock, the largest ones tell the scatter.
     return np.asarray(np.maximum(squares[..., :kept].sum(axis=-1) / (kept * _KEPT_SQUARE),
                                  squares.sum(axis=-1) / (4.0 * count)))
-
-
-def _finite(values: FloatArray) -> FloatArray:
-    return values[np.isfinite(values)]
 
 
 def _mean_square(squares: FloatArray) -> float:

@@ -76,7 +76,8 @@ class PulseFollower:
     """
     Follow the pulses of a target, the first of which is the first of the `queue`.
 
-    Those in the queue (s) that are decided about are taken away; the true ones go to the `sink`.
+    The `model` of the intervals is started by the `lock`. Those in the queue (s) that are decided
+    about are taken away; the true ones go to the `sink`.
     `confirmed` (s) is the latest of these. Once the match is `lost`, nothing is decided; of a
     `probe`, which has no trigger cycles to lose, it is lost wherever the number of passed teeth is
     not sure. `marks`, `levels` and `times` are those of the intervals since the pattern of the
@@ -96,6 +97,8 @@ class PulseFollower:
         self._learnt = 0  # times that the pattern was learnt
         self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
         self._alternates = False
+        model.start(math.log(lock.interval), scatter=lock.scatter, count=lock.known,
+                    intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
         # the latest pulses, dropped ones too
         self._recent = deque[float](maxlen=_AGREEING + 1)
         verdicts.counts['accepted'] += 1
@@ -192,13 +195,6 @@ class PulseFollower:
 
     # --- doubtful pulses ---
 
-    def _rules(self) -> PathRules:
-        return PathRules(
-            self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
-            np.maximum(self._lock.believed, self._options.tolerance).tolist(),
-            self._options.maximum_missing, self._model.expected, self._model.predictions,
-            self._model.tick, self._model.degrees)
-
     def _decide(self, final: bool) -> bool:
         """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""
         queue, model = self._queue, self._model
@@ -215,7 +211,11 @@ class PulseFollower:
             return False
         if self._is_of_clock():
             return True
-        rules = self._rules()
+        steps, widths, _ = self._lock.lists
+        given = np.maximum(self._lock.believed, self._options.tolerance).tolist()
+        rules = PathRules(
+            steps, widths, model.scatter, given, self._options.maximum_missing, model.expected,
+            model.predictions, model.tick, model.degrees)
         paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent, using=model.chosen)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
             paths = rules.extend(paths, pulse)

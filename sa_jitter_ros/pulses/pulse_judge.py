@@ -17,6 +17,7 @@ the tolerance 1 all pulses are taken for true, as is right for a clean encoder o
 speed changes from one pulse to the next by more than a shaft is expected to.
 """
 
+from dataclasses import replace
 import math
 
 from sa_jitter_ros.pulses.loose_marks import LooseMarks
@@ -136,20 +137,19 @@ class PulseJudge:
 
     def _lose(self, follower: PulseFollower) -> None:
         """Discard the trigger cycle and match the target again from the waiting pulses on."""
-        model = self._model
+        model, known = self._model, int(self._model.degrees)
         soon = model.taken < _KNOWN_WELL  # what is lost so may have other intervals
         self._start.failed = self._start.failed + 1 if soon else 0
         self._end = None if model.irregular else End(
             follower.confirmed, model.level, model.scatter,
-            model.known // 2 if soon else model.known, follower.tooth, model.unsteady)
+            known // 2 if soon else known, follower.tooth, model.unsteady)
         self._confirmed, self._follower = follower.confirmed, None
         self._counter.stop()
 
     def _begun(self, lock: Lock) -> PulseFollower:
         """Begin a sequence at the first waiting pulse."""
-        first, end, model = self._queue[0], self._end, self._model
+        first, end = self._queue[0], self._end
         passed = None
-        scatter, count = lock.scatter, lock.known
         if end is not None:
             gap = first - end.time
             teeth = [gap / math.exp(level) for level in (end.level, math.log(lock.interval))]
@@ -158,13 +158,11 @@ class PulseJudge:
             fits = lock.even or (end.tooth + number - lock.tooth) % int(lock.steps.sum()) == 0
             if number and fits and max(abs(item - number) for item in teeth) <= NEAR_WHOLE:
                 passed = number
-            known_better = end.known >= max(_KNOWN_WELL, count)
-            if known_better or 1.0 / _SAME_SCATTER < scatter / end.scatter < _SAME_SCATTER:
-                scatter, count = end.scatter, max(count, end.known)
+            known_better = end.known >= max(_KNOWN_WELL, lock.known)
+            if known_better or 1.0 / _SAME_SCATTER < lock.scatter / end.scatter < _SAME_SCATTER:
+                lock = replace(lock, scatter=end.scatter, known=max(lock.known, end.known))
         self._counter.begin(first, lock.tooth, passed=passed)
-        model.start(math.log(lock.interval), scatter=scatter, count=count,
-                    intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
-        follower = PulseFollower(lock, self._queue, model, options=self._options,
+        follower = PulseFollower(lock, self._queue, self._model, options=self._options,
                                  sink=self._counter, verdicts=self.verdicts)
         if self.hides_missing:
             self.verdicts.say(f'{HIDDEN}: all are taken for true')

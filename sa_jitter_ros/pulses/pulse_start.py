@@ -218,17 +218,17 @@ class PulseStart:
         probe = self._probe(replace(
             lock, slot=0, steps=lock.steps[back], widths=lock.widths[back],
             believed=lock.believed[back]), -pulses[lock.first::-1])
+        slot = (lock.slot - probe.slot) % lock.steps.size
+        turn = slot if lock.even else 0  # without an index the first pulse is number 0
         return replace(lock, first=int(np.searchsorted(pulses, -probe.confirmed)),
-                       slot=(lock.slot - probe.slot) % lock.steps.size).numbered()
+                       slot=slot - turn, widths=np.roll(lock.widths, -turn),
+                       believed=np.roll(lock.believed, -turn))
 
     def _probe(self, lock: Lock, pulses: FloatArray) -> PulseFollower:
         """Return what followed the pulses (n,) from this lock on until it lost them."""
-        model = new_model(self._target, self._options)
-        model.start(math.log(lock.interval), scatter=lock.scatter, count=lock.known,
-                    intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
         probe = PulseFollower(
-            lock, pulses.tolist(), model, options=self._options, verdicts=Verdicts(), probe=True,
-            sink=TriggerCounter(teeth=1, teeth_per_trigger=1))
+            lock, pulses.tolist(), new_model(self._target, self._options), options=self._options,
+            sink=TriggerCounter(teeth=1, teeth_per_trigger=1), verdicts=Verdicts(), probe=True)
         probe.follow(final=True)
         return probe
 

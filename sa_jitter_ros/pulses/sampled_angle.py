@@ -79,7 +79,6 @@ class AngleCrossings:
     :param marks: number of marks on a revolution; one is at angle 0.
     :param time_tolerance: time (s) by which a sample may be early before a new run begins.
     :param runs: of the angle; those of an angle in rad if it is None.
-    :param turn: a revolution, in the unit of the angle.
     :param counted: the angle is a counter, and a pulse has the time of the sample that counts it.
     :raises ParameterError: an option is out of range.
 
@@ -96,17 +95,16 @@ class AngleCrossings:
     """
 
     def __init__(self, *, marks: int = 1, time_tolerance: float = 0.01,
-                 runs: AngleRuns | None = None, turn: float = _TURN, counted: bool = False
-                 ) -> None:
+                 runs: AngleRuns | None = None, counted: bool = False) -> None:
         if marks != int(marks) or marks < 1:
             raise ParameterError(f'marks {marks} must be a whole number, 1 or more')
         if not 0.0 <= time_tolerance < np.inf:
             raise ParameterError(f'time_tolerance {time_tolerance} s must be finite, from 0 on')
-        self._pitch = turn / int(marks)
+        self._runs = runs or AngleRuns(_TURN, moduli=(_TURN,))
+        self._pitch = self._runs.turn / int(marks)
         self._counted = counted
         self._back = max(0.5 * self._pitch, _DITHER if counted else 0.0)  # of a reversal
         self._tolerance = time_tolerance
-        self._runs = runs or AngleRuns(_TURN, moduli=(_TURN,))
         self._samples = self._dropped = self._pulses = 0
         self._stops = self._reversals = self._restarts = 0
         self._latest = -math.inf  # time of the latest sample
@@ -357,8 +355,8 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
 def _of_counter(counts: FloatArray, marks: int, modulus: float = 0.0) -> AngleCrossings:
     """Return the crossings of a counter, a turn of which is the modulus if `marks` divide it."""
     turn = modulus if modulus and modulus % marks == 0.0 else float(marks)
-    return AngleCrossings(marks=marks, turn=turn, counted=turn == marks,
-                          runs=counter_runs(counts, turn, modulus))
+    runs = counter_runs(counts, turn, modulus)
+    return AngleCrossings(marks=marks, runs=runs, counted=turn == marks)
 
 
 def counter_pulses(counts: ArrayLike, *, start_time: float = 0.0, sample_rate: float,
@@ -474,8 +472,8 @@ def pulses_from_angle(times: ArrayLike, angle: ArrayLike, *, pulses_per_revoluti
                               'for shift in (1, 2, 4, 8, 16): counts ^= counts >> shift')
         crossings = _of_counter(finite, int(marks), modulus or 0.0)
     else:
-        crossings = AngleCrossings(marks=int(marks), turn=turn, runs=AngleRuns(
-            turn, moduli=(turn, modulus or turn)))
+        runs = AngleRuns(turn, moduli=(turn, modulus or turn))
+        crossings = AngleCrossings(marks=int(marks), runs=runs)
     pulses = np.append(crossings.update(times, values), crossings.flush())
     state = crossings.state
     if not pulses.size:

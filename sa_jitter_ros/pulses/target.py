@@ -88,13 +88,6 @@ class Lock:
         return replace(self, widths=widths, scatter=pattern.scatter,
                        believed=np.where(pattern.known, believed, self.believed))
 
-    def numbered(self) -> 'Lock':
-        """Return the lock in which the first pulse is number 0 if there is no index."""
-        if not self.even:
-            return self
-        return replace(self, slot=0, widths=np.roll(self.widths, -self.slot),
-                       believed=np.roll(self.believed, -self.slot))
-
 
 def _of_narrow(widths: FloatArray, scatter: float) -> FloatArray:
     """Return deviations (m,) that a scatter of whole intervals explains in narrower ones."""
@@ -117,6 +110,7 @@ class EvenTarget:
 
     def __init__(self, *, marks: int) -> None:
         self.marks = marks
+        self._stray = STRAY_OF_ONE if marks == 1 else STRAY_OF_MARKS
 
     def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
                   ) -> int:
@@ -135,7 +129,7 @@ class EvenTarget:
     def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
         """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
         start = max(pulses.size - _LATEST, 0)
-        found = self._chain(pulses[start:], scatter)
+        found = find_chain(pulses[start:], scatter, stray=self._stray)
         if found is None:
             return self.unsteady(pulses)
         return self._locked(pulses[start:], found, start)
@@ -144,12 +138,8 @@ class EvenTarget:
         """Match pulses (n,) in s that follow each other at a speed that scatters, None if not."""
         if not unsteadiness(np.log(np.diff(pulses))):
             return None
-        found = self._chain(pulses, None)
+        found = find_chain(pulses, None, stray=self._stray)
         return self._locked(pulses, found, 0) if found is not None and found.unsteady else None
-
-    def _chain(self, pulses: FloatArray, scatter: float | None) -> Chain | None:
-        return find_chain(pulses, scatter,
-                          stray=STRAY_OF_ONE if self.marks == 1 else STRAY_OF_MARKS)
 
     def _locked(self, pulses: FloatArray, found: Chain, start: int) -> Lock:
         """Return the lock on pulses (n,), the latest, of which `start` came before."""
@@ -187,16 +177,15 @@ class ToothedWheel:
 
     def __init__(self, *, teeth: int, tolerance: float, missing: int = 0,
                  widths: FloatArray | None = None) -> None:
-        self._teeth, self._present = teeth, teeth - missing
-        if self._present < 2:
+        self._teeth, self.marks = teeth, teeth - missing
+        if self.marks < 2:
             raise ParameterError(
-                f'missing_teeth {missing} of {teeth} leaves {self._present} teeth: a wheel needs '
+                f'missing_teeth {missing} of {teeth} leaves {self.marks} teeth: a wheel needs '
                 '2 or more; for a single tooth set pulses_per_revolution to 1')
         self._tolerance, self._widths = tolerance, widths
         self._least = _DOUBLE if widths is None else _DOUBLE * float(
             widths.min() / np.median(widths))
-        self.marks = self._present
-        self.memory = 2 * (self._present + 1)
+        self.memory = 2 * (self.marks + 1)
 
     def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
                   ) -> int:
@@ -205,22 +194,22 @@ class ToothedWheel:
 
         It `failed` so often before, or found a lock that was lost soon.
         """
-        return max(self._present + 1, tried + 1)
+        return max(self.marks + 1, tried + 1)
 
     def lock(self, every: FloatArray, scatter: float | None) -> Lock | None:
         """Match the latest pulses (n,) in s, None if they do not fit: a revolution is needed."""
-        if every.size <= self._present:
+        if every.size <= self.marks:
             return None
         intervals = np.diff(every)
         single = np.append(0, 1 + np.flatnonzero(intervals >= self._least * np.median(intervals)))
-        if single.size <= self._present:
+        if single.size <= self.marks:
             return None
-        single = single[-self._present - 1:]
+        single = single[-self.marks - 1:]
         intervals = np.diff(every[single])
         # At a steady speed the tooth interval follows from the revolution, at a changing one from
         # the intervals around it, of which few may be gaps.
         guesses = [np.full(intervals.size, intervals.sum() / self._teeth)]
-        if self._present >= 8 and self._widths is None:
+        if self.marks >= 8 and self._widths is None:
             guesses.append(median_filter(intervals, size=5, mode='mirror'))
         for guess in guesses:
             found = self._matched(intervals / guess)

@@ -74,11 +74,6 @@ class TriggerCounter:
         self._numbering: int | None = None  # of the teeth
         self.discarded = 0
 
-    @property
-    def running(self) -> bool:
-        """Whether there is a run to which pulses can be added."""
-        return bool(self._times)
-
     def begin(self, time: float, tooth: int, *, passed: int | None = None) -> None:
         """Begin a run at a pulse (s) of this tooth, `passed` teeth after the last run's end."""
         self.stop()
@@ -99,12 +94,12 @@ class TriggerCounter:
 
     def drop(self) -> None:
         """Record that a pulse behind the latest one was dropped."""
-        if self.running:
+        if self._times:
             self._dropped.append(len(self._times) - 1)
 
     def stop(self, *, known: bool = True) -> None:
         """End the run, discard its unfinished trigger cycle; `known`: the last pulse is valid."""
-        if self.running:
+        if self._times:
             self._count()
             self._last = self._steps[0]
             self.discarded += not self._starting or bool(self._waiting)
@@ -119,13 +114,13 @@ class TriggerCounter:
 
     def know_marks(self, numbering: int | None) -> None:
         """Take the number of the numbering of teeth from the next pulse on, None if not known."""
-        if numbering != self._numbering and self.running:
+        if numbering != self._numbering and self._times:
             self._count()
         self._numbering = numbering
 
     def take(self) -> TriggerPulses:
         """Return the new trigger pulses."""
-        if self.running:
+        if self._times:
             self._count()
         found, self._found = self._found, []
         return TriggerPulses.joined(found)

@@ -28,9 +28,8 @@ _MAX_SAMPLE_BYTES = 1 << 40
 _MAX_PULSE_BYTES = 8 * MAX_PULSES
 MAX_FIELD_BYTES = 1 << 20
 
-RawArray = Array
 #: Returns the array under a key of a file, of at most so many bytes.
-Load = Callable[[str, int], RawArray]
+Load = Callable[[str, int], Array]
 #: The names of the arrays of a file, and what loads one.
 Arrays = tuple[Collection[str], Load]
 SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
@@ -212,7 +211,7 @@ def converted_fields(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: CONVERTED[name](name, np.asarray(value)) for name, value in values.items()}
 
 
-def _real(name: str, array: RawArray) -> RawArray:
+def _real(name: str, array: Array) -> Array:
     if array.dtype.kind not in 'fiub':
         raise RecordingError(f'{name} of type {array.dtype}: give real numbers')
     return array
@@ -231,8 +230,7 @@ def _numbers(name: str, text: str, keys: Collection[str]) -> list[float]:
                              ) from None
 
 
-def _stacked(keys: Sequence[str], load: Load, remarks: list[str], *,
-             mapped: bool) -> RawArray:
+def _stacked(keys: Sequence[str], load: Load, remarks: list[str], *, mapped: bool) -> Array:
     """Return the samples under some keys; `mapped`: by the user, in either orientation."""
     parts = []
     for key in keys:
@@ -249,7 +247,7 @@ def _stacked(keys: Sequence[str], load: Load, remarks: list[str], *,
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _samples(name: str, array: RawArray) -> RawArray:
+def _samples(name: str, array: Array) -> Array:
     array = _real(name, array)
     if array.ndim == 1 or (array.ndim == 2 and array.shape[1] == 1):
         array = array.reshape(1, -1)
@@ -262,26 +260,26 @@ def _samples(name: str, array: RawArray) -> RawArray:
     return array
 
 
-def _vector(name: str, array: RawArray) -> FloatArray:
+def _vector(name: str, array: Array) -> FloatArray:
     if array.size != max(array.shape, default=1):
         raise RecordingError(f'{name} of shape {array.shape}: give one row of numbers')
     return np.array(_real(name, array), dtype=np.float64).reshape(-1)
 
 
-def _number(name: str, array: RawArray) -> float:
+def _number(name: str, array: Array) -> float:
     if array.size != 1:
         raise RecordingError(f'{name} of shape {array.shape}: give a single number')
     return float(_real(name, array).reshape(-1)[0])
 
 
-def _count(name: str, array: RawArray, *, least: int = 1) -> int:
+def _count(name: str, array: Array, *, least: int = 1) -> int:
     value = _number(name, array)
     if not (value == np.floor(value) and least <= value < 2**31):
         raise RecordingError(f'{name} {value}: give a whole number, at least {least}')
     return int(value)
 
 
-def _strings(name: str, array: RawArray) -> tuple[str, ...]:
+def _strings(name: str, array: Array) -> tuple[str, ...]:
     if array.dtype.kind == 'S':
         array = np.char.decode(array, 'utf-8', 'replace')
     if array.dtype.kind != 'U':
@@ -289,7 +287,7 @@ def _strings(name: str, array: RawArray) -> tuple[str, ...]:
     return tuple(item.strip() for item in array.reshape(-1).tolist())
 
 
-def _counted_pulses(counter: RawArray, start_time: float, rate: float, a_turn: int,
+def _counted_pulses(counter: Array, start_time: float, rate: float, a_turn: int,
                     remarks: list[str]) -> FloatArray:
     """Return the pulse times (s) of a counter of `a_turn` pulses a revolution."""
     values = _samples('tach_count', counter)
@@ -297,8 +295,7 @@ def _counted_pulses(counter: RawArray, start_time: float, rate: float, a_turn: i
         raise RecordingError(f'tach_count of shape {counter.shape}: give one row')
     counts = values[0].astype(np.float64)
     if not np.all((counts == np.floor(counts)) & (abs(counts) < 2.0**53)):
-        raise RecordingError('tach_count contains fractions, NaN or values above 2^53: give '
-                             'counts')
+        raise RecordingError('tach_count has fractions, NaN or values above 2^53: give counts')
     try:
         pulses, state = counter_pulses(counts.astype(np.int64), start_time=start_time,
                                        sample_rate=rate, pulses_per_revolution=a_turn)
@@ -317,7 +314,7 @@ def _counted_pulses(counter: RawArray, start_time: float, rate: float, a_turn: i
 
 
 # The fields that are not samples, each with its conversion from an array.
-CONVERTED: Mapping[str, Callable[[str, RawArray], Any]] = {
+CONVERTED: Mapping[str, Callable[[str, Array], Any]] = {
     'sample_rate': _number, 'tach_rate': _number, 'start_time': _number, 'ratio': _number,
     'pulses_per_revolution': _count, 'pulses_per_trigger': _count,
     'missing_teeth': lambda name, array: _count(name, array, least=0),

@@ -24,8 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES, RawArray
+from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import library, mapped
 
@@ -73,7 +74,7 @@ def _datasets(file: Any, group: Any, prefix: str, above: tuple[Any, ...]
                     yield f'{prefix}{number}/{name}', target
 
 
-def _array(file: Any, name: str, dataset: Any, limit: int) -> RawArray:
+def _array(file: Any, name: str, dataset: Any, limit: int) -> Array:
     """Return the array of a dataset, of at most `limit` bytes, as MATLAB has it."""
     kind = dataset.attrs.get('MATLAB_class', b'')
     if kind == b'cell':

@@ -37,8 +37,9 @@ import tempfile
 import zlib
 
 import numpy as np
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES, RawArray
+from sa_jitter_ros.recordings.fields import Arrays, MAX_FIELD_BYTES
 from sa_jitter_ros.recordings.hdf5_format import hdf5_arrays
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 
@@ -53,7 +54,7 @@ _TEXTS = {1: 'latin-1', 2: 'latin-1', 4: 'utf-16', 16: 'utf-8', 17: 'utf-16', 18
 _HEADER, _HEAD, _STEP = 128, 4096, 1 << 20
 _DEEPEST, _MOST_ELEMENTS = 32, 10_000  # of structs in structs; of an array of structs
 
-_Variables = Iterator[tuple[str, Callable[[int], RawArray]]]
+_Variables = Iterator[tuple[str, Callable[[int], Array]]]
 
 
 @dataclass(frozen=True)
@@ -164,7 +165,7 @@ class _Reader:
                         data, self._matrix(data, element),
                         f'{key}/{name}' if count == 1 else f'{key}/{number}/{name}', depth + 1)
 
-    def _unpacked(self, whole: _Buffer, element: _Element, size: int, limit: int) -> RawArray:
+    def _unpacked(self, whole: _Buffer, element: _Element, size: int, limit: int) -> Array:
         """Read the array of a compressed variable of `size` bytes."""
         data = _inflate(whole, element, size)
         return self._array(data, self._matrix(data, self._element(data, 0, len(data))), limit)
@@ -201,7 +202,7 @@ class _Reader:
         return _Matrix(data[name.start:name.stop].decode('ascii', 'replace'), kind,
                        tuple(shape.tolist()), at, element.stop)
 
-    def _array(self, data: _Buffer, matrix: _Matrix, limit: int) -> RawArray:
+    def _array(self, data: _Buffer, matrix: _Matrix, limit: int) -> Array:
         if not matrix.shape or min(matrix.shape) < 0 or 8 * prod(matrix.shape) > limit:
             raise RecordingError(f'{matrix.name} of shape {matrix.shape} exceeds its limit of '
                                  f'{limit} bytes: split the recording')
@@ -235,7 +236,7 @@ class _Reader:
             yield ''.join(self._text(data, cell).tolist())
             at = self._after(element, at)
 
-    def _text(self, data: _Buffer, matrix: _Matrix) -> RawArray:
+    def _text(self, data: _Buffer, matrix: _Matrix) -> Array:
         """Return the rows of a character matrix."""
         part = self._element(data, matrix.content, matrix.stop)
         check_size('a text', part.stop - part.start, MAX_FIELD_BYTES, 'shorten it')
@@ -255,7 +256,7 @@ def _or_refusal(key: str, parts: Callable[[], _Variables]) -> _Variables:
     except (RecordingError, struct.error, zlib.error) as error:
         reason = RecordingError(f'{key}: {error}')
 
-    def refuse(limit: int) -> RawArray:
+    def refuse(limit: int) -> Array:
         raise reason
 
     return iter([(key, refuse)])

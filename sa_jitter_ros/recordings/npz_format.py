@@ -30,8 +30,9 @@ import zipfile
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike
+from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import Arrays, CONVERTED, RawArray
+from sa_jitter_ros.recordings.fields import Arrays, CONVERTED
 from sa_jitter_ros.recordings.limits import check_inflation, check_size, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import mapped, Recording
 
@@ -92,7 +93,7 @@ def write_npz(path: str | os.PathLike[str], recording: Recording, *,
                     stream.write(block.astype(dtype).tobytes(order='F'))
 
 
-def _member(archive: zipfile.ZipFile, path: Path, name: str, limit: int) -> RawArray:
+def _member(archive: zipfile.ZipFile, path: Path, name: str, limit: int) -> Array:
     """Return the array of a member: in memory if small, else mapped from a file."""
     info = archive.getinfo(f'{name}.npy')
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
