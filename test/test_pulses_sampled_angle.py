@@ -345,7 +345,7 @@ def test_a_count_that_is_wrong_by_one_for_a_sample_moves_no_pulse():
 def test_a_wrong_count_in_the_last_sample_of_a_block_waits_for_the_next(wrong):
     counts = np.arange(800) // 20
     counts[333] += wrong
-    crossings = AngleCrossings(marks=10, turn=10.0, counted=True,
+    crossings = AngleCrossings(marks=10, counted=True,
                                runs=counter_runs(counts.astype(float), 10.0))
     found = [crossings.update(TIME[block], counts[block])
              for block in (slice(0, 334), slice(334, 800))]

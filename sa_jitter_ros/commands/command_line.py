@@ -24,7 +24,7 @@ from typing import Any, NoReturn, TypeVar
 import warnings
 
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import DataWarning, one_line, ParameterError, SaJitterError
+from sa_jitter_ros.errors import one_line, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.lifetime import in_main_thread
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.settings import AVERAGER, section
@@ -132,7 +132,7 @@ def few_collections() -> Iterator[None]:
 def plain_warnings(program: str) -> Iterator[None]:
     """Print warnings as lines of a program, without the place in its source."""
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter('always', DataWarning)
+        warnings.simplefilter('always', UserWarning)
         try:
             yield
         finally:
