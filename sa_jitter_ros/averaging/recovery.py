@@ -132,8 +132,8 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     samples of the time between two measured pulses (linear law), and `periods` (cycle,) these
     times (s). `cycle_length` is r, `first_angle` the angle of the first pulse, both in fundamental
     cycles. `declared_standard_deviation` (s) is that of the declared pulse error. `orders` are the
-    orders to use; without it, the strongest of the integer and the `additional_orders` are used,
-    at most `most_orders` and as many more as there are fractions in `additional_orders`.
+    orders to use; without it, the `additional_orders` and the strongest of the integer ones are
+    used, of these at most `most_orders` and as many more as there are fractions among the others.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
     cycle_length or standard deviation that is not positive.
