@@ -97,7 +97,7 @@ class LineSearch:
             for row in np.ascontiguousarray(power.T)], axis=1), _TINY)
         level = np.median(background, axis=0)
         # Where harmonics are dense it is their own level, and less changes from cycle to cycle.
-        background = np.minimum(background, self._coherent(series)[1] * np.sum(
+        background = np.minimum(background, _coherent(series)[1] * np.sum(
             cycle_weights(series.shape[1]) ** 2))
         contrast = np.max(power / background, axis=1)
         telling = np.max((g**2)[:, None] * power / level, axis=1)
@@ -117,21 +117,10 @@ class LineSearch:
         What is far below the level of `significant_orders` need not be fitted.
         """
         series = self._series(errors, g)
-        power, scatter = self._coherent(series)
+        power, scatter = _coherent(series)
         limit = significance(len(self.orders) * series.shape[2], cycles)
         return np.asarray((cycles * (power - scatter / series.shape[1])
                            > _FAR_BELOW * limit * scatter).any(axis=1))
-
-    def _coherent(self, series: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """
-        Return the power (order, channel) of the mean of a series, and its variance over cycles.
-
-        Without the taper over the cycles.
-        """
-        series = series / cycle_weights(series.shape[1])[:, None]
-        mean = series.mean(axis=1)
-        squares = np.sum(np.abs(series - mean[:, None]) ** 2, axis=1)
-        return np.abs(mean) ** 2, np.maximum(squares / (series.shape[1] - 1), _TINY)
 
     def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
         """Return what (row) orders show of unit lines at each order (column)."""
@@ -151,7 +140,7 @@ class LineSearch:
         Orders are weighted by their square, as in the fit of the errors. True pulse errors can
         only give a value above 1; without orders it is 1.
         """
-        before, after = (self._coherent(self._series(item, orders))[0]
+        before, after = (_coherent(self._series(item, orders))[0]
                          for item in (0.0 * errors, errors))
         weight = orders[:, None] ** 2 / np.maximum(np.sum(before, axis=0), _TINY)
         known = float(np.sum(weight * before))
@@ -180,6 +169,18 @@ class LineSearch:
             begin, end = max(near - _MAIN_LOBE, 0), min(near + _MAIN_LOBE + 1, lines)
             shift = _MAIN_LOBE - near
             yield weight[begin + shift:max(end, begin) + shift], self.spectra[begin:end]
+
+
+def _coherent(series: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """
+    Return the power (order, channel) of the mean over cycles, and the variance of the cycles.
+
+    `series` (order, cycle, channel) is tapered over the cycles, which is undone.
+    """
+    series = series / cycle_weights(series.shape[1])[:, None]
+    mean = series.mean(axis=1)
+    squares = np.sum(np.abs(series - mean[:, None]) ** 2, axis=1)
+    return np.abs(mean) ** 2, np.maximum(squares / (series.shape[1] - 1), _TINY)
 
 
 def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: int,
