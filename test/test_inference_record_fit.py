@@ -366,3 +366,29 @@ def test_a_speed_that_swings_as_one_wave_makes_bends_and_no_sidebands(rng, wave)
     bends = 4.0 * (0.5 * (times[1:] + times[:-1]) - middle)  # of u (1 - u), at its middle
     off = found.bends[2:-2, 0] - (bends - bends.mean())[2:-2]
     assert np.std(off) < 0.3 * np.std(bends)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_sidebands_are_no_pulse_errors_that_swing(seed):
+    """Errors that swing as fast, or at an alias, make lines at the same places, and others."""
+    rng = np.random.default_rng([38, seed])
+    cycle, rate, speed, count = rng.uniform(0.5, 1.0), 6400.0, 25.0, 300
+    mesh = float(rng.integers(15, 30))
+    offset = np.cumsum(rng.uniform(0.3, 0.7, 2))
+    sides = np.add.outer([mesh, 2.0 * mesh], [*offset, *-offset]).ravel()
+    time = np.arange(int((count + 2) * cycle / speed * rate)) / rate
+    vibration = sum(size * np.cos(2.0 * np.pi * (g * speed * time + rng.uniform()))
+                    for g, size in [(mesh, 1.0), (2.0 * mesh, 0.7),
+                                    *zip(sides, rng.uniform(0.02, 0.2, sides.size))])
+    errors = rng.normal(0.0, 2e-5, count)
+    times = (np.arange(count) + 0.5) * cycle / speed + errors
+    found = OpenRecord((vibration + 0.02 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+                       times, measured=np.ones(count, bool), cycle_length=cycle,
+                       orders=[mesh, 2.0 * mesh], jitter_std=2e-5).fit()
+    wrong = (found.errors - errors)[2:-2]
+    z = (wrong - wrong.mean()) / found.standard_errors[2:-2]
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size) + 0.1)
+    near = np.abs(found.orders[2:, None] - sides) * cycle * count
+    assert near.min(axis=0).max() < 0.5
+    made_up = np.abs(found.amplitudes[0, 2:])[near.min(axis=1) > 0.5]
+    assert np.all(made_up < 0.01)

@@ -99,11 +99,6 @@ class States:
         self.read()
 
     @property
-    def unsure(self) -> float:
-        """Return the standard error of the pulse errors (s), those of most pulses."""
-        return float(self.size[0] * np.sqrt(1.0 - self.resolved[0]))
-
-    @property
     def moved(self) -> BoolArray:
         """Return which lines (line,) are orders of shafts, which the states move."""
         return self.movable & (np.arange(self.movable.size) < self.orders.size)

@@ -133,17 +133,31 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
     for size, place, tone in found:
         if size < least_power or len(orders) + len(tones) >= room:
             break
-        others = np.array([*states.orders, *orders])
-        beside = np.array([*states.tones, *tones])
+        taken = np.append(states.orders, orders)
         if tone:
-            near_one = np.any(np.abs(beside - place) * duration < APART) or np.any(
-                np.abs(others - place / states.frequency) * states.span < APART)
-        else:
-            near_one = np.any(np.abs(others - place) * states.span < APART)
-        if not near_one:
+            taken = np.append(taken * states.frequency, [*states.tones, *tones])
+        if np.abs(taken - place).min() * (duration if tone else span) >= APART:
             (tones if tone else orders).append(float(place))
             least_power = least_power or _SHARE * size
-    return orders, tones
+    return [*orders, *_partners(states, orders, room - len(tones))], tones
+
+
+def _partners(states: States, orders: Sequence[float], room: int) -> list[float]:
+    """
+    Return lines as far from other declared ones as new undeclared orders, on either side.
+
+    Pulse errors that swing as fast, or at an alias, make lines at all these places. So they take
+    the sidebands of a modulation for theirs, unless all have their own amplitudes from the start.
+    With the `orders` they are `room` at most.
+    """
+    declared, found = states.orders[:states.declared], list(orders)
+    offset = np.abs(nearest_orders(np.array(orders), declared)[1])
+    offset = offset[(offset * states.span > _SKIRT) & (offset < 1.0 / states.cycle_length)]
+    for line in (offset[:, None, None] * [[-1.0], [1.0]] + declared).ravel().tolist():
+        near = np.abs(np.append(states.orders, [0.0, *found]) - line).min() * states.span
+        if 0.0 < line < states.highest and near > APART and len(found) < room:
+            found.append(line)
+    return found[len(orders):]
 
 
 def least_seen(samples: float, channels: int) -> float:
@@ -153,12 +167,10 @@ def least_seen(samples: float, channels: int) -> float:
 
 def add_lines(states: States, orders: Sequence[float] | Array,
               tones: Sequence[float] | Array) -> None:
-    """Add undeclared lines, their amplitudes 0."""
-    old = np.split(states.amplitudes, [states.orders.size], axis=1)
-    none = [np.zeros((len(states.amplitudes), len(new))) for new in (orders, tones)]
-    states.amplitudes = np.hstack([old[0], none[0], old[1], none[1]])
+    """Add undeclared lines, and fit all."""
     states.orders = np.append(states.orders, orders)
     states.tones = np.append(states.tones, tones)
+    fit_lines(states)
 
 
 def refine(states: States) -> float:
@@ -166,7 +178,7 @@ def refine(states: States) -> float:
     Move each undeclared line to where the residual has nothing left of it.
 
     The declared lines alone tell how fast the angle runs; those that may move do not. What a
-    tone moves by at most is returned in standard errors.
+    line moves by at most is returned in standard errors.
     """
     states.make_tables()
     residual = states.residual()
@@ -187,6 +199,7 @@ def refine(states: States) -> float:
         float(bottom[:states.declared] @ declared**2) * curves[0], np.finfo(np.float64).tiny)
     most_stretched = most_of[0] / declared.max()
     stretch = min(max(stretch, -most_stretched), most_stretched)
+    furthest = 0.0
     for chosen, curve, most in zip((slice(states.declared, count), slice(count, None)), curves,
                                    most_of):
         with np.errstate(divide='ignore', invalid='ignore'):
@@ -194,22 +207,23 @@ def refine(states: States) -> float:
                                  neginf=0.0).clip(-most, most)
         lines = states.orders[states.declared:] if chosen.stop else states.tones
         lines += step
+        in_errors = np.abs(step) * np.sqrt(bottom[chosen] * curve)
+        furthest = max(furthest, float(in_errors.max(initial=0.0)))
     states.orders[states.declared:] *= 1.0 - stretch
     states.states[:, 0] += stretch * states.ramp
     states.trend += stretch
     states.read()
-    return float(np.max(np.abs(step) * np.sqrt(bottom[count:] * curves[1]), initial=0.0))
+    return furthest
 
 
-def prune(states: States, least: float) -> None:
-    """Take out undeclared lines whose amplitudes are noise."""
+def prune(states: States, least: float) -> tuple[Array, Array, Array]:
+    """Take out undeclared lines whose amplitudes are noise; return `both_ways` of the others."""
     lines = states.amplitudes.shape[1]
     power = np.abs(states.amplitudes) ** 2 / states.amplitude_variances()
     kept = (np.arange(lines) < states.declared) | (power.mean(axis=0) > 2.0 * least)
     orders, tones = np.split(kept, [states.orders.size])
     states.orders, states.tones = states.orders[orders], states.tones[tones]
-    states.amplitudes = states.amplitudes[:, kept]
-    states.synchronous, states.movable = states.synchronous[kept], states.movable[kept]
+    return fit_lines(states)
 
 
 def nearest_orders(lines: Array, declared: Array) -> tuple[NDArray[np.intp], Array]:
@@ -283,8 +297,6 @@ def let_stand(states: States, ways: tuple[Array, Array, Array], *, searching: bo
         return
     states.orders = states.orders[np.append(np.ones(states.declared, np.bool_), ~standing)]
     states.tones = new
-    lines = states.orders.size + states.tones.size
-    states.amplitudes = np.zeros((len(states.amplitudes), lines), np.complex128)
     fit_lines(states)
     states.step()
 

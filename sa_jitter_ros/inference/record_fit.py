@@ -26,14 +26,13 @@ from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
-    add_lines, both_ways, fit_lines, follow_trend, let_stand, new_lines, prune, refine)
+    add_lines, fit_lines, follow_trend, let_stand, new_lines, prune, refine)
 from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
 
-# Steps before lines are looked for, which have to leave them no bends, and those that a search may
-# take; what its last one may change, in standard errors.
-_FIRST_STEPS, _MOST_STEPS, _SETTLED = 4, 20, 0.1
+# Steps that a search may take, and what its last one may change, in standard errors.
+_MOST_STEPS, _SETTLED = 20, 0.1
 _PRUNED = 4.0  # mean power of a line in its variances that keeps it
 # The last fit expects pulse errors that are so many times as large as they, or their standard
 # errors, are, so that they are hardly shrunk.
@@ -110,29 +109,31 @@ class OpenRecord:
         fit_lines(states)
         _search(states, known)
         states.converged = True
-        for _ in range(_MOST_STEPS):
-            if states.step() < _SETTLED * states.unsure:
-                break
+        _settle(states)
         return _result(states, self._false_alarm)
+
+
+def _settle(states: States) -> None:
+    """Do steps until the pulse errors hardly change: what they leave are lines, and no bends."""
+    for _ in range(_MOST_STEPS):
+        unsure = states.size[0] * np.sqrt(1.0 - states.resolved[0])
+        if states.step() < _SETTLED * unsure:
+            break
 
 
 def _search(states: States, known: tuple[Array, Array] | None) -> None:
     """
     Fit states and lines by turns until no line is found any more.
 
-    Lines that are `known` come after the first steps, too: high ones follow a trend that the
-    declared ones have shown.
+    Lines that are `known` come after steps, too: high ones follow a trend that the declared ones
+    have shown.
     """
     look, lines, mended = known is None, known or ((), ()), 0
-    for _ in range(_FIRST_STEPS):
-        states.step()
     while True:
-        for _ in range(2):
-            states.step()
+        _settle(states)
         (orders, tones), lines = new_lines(states) if look else lines, ((), ())
         if len(orders) or len(tones):
             add_lines(states, orders, tones)
-            fit_lines(states)
             if look:
                 refine(states)
                 let_stand(states, fit_lines(states), searching=True)
@@ -141,7 +142,7 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
         else:
             mended += 1
     if look:
-        let_stand(states, both_ways(states), searching=False)
+        let_stand(states, prune(states, _PRUNED), searching=False)
         for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
             moved = refine(states)
             fit_lines(states)
@@ -149,7 +150,6 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
             if moved < _SETTLED:
                 break
         prune(states, _PRUNED)
-        fit_lines(states)
 
 
 def _result(states: States, false_alarm: float) -> RecordFit:
