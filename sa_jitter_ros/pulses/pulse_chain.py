@@ -86,8 +86,9 @@ def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRA
     every = Chain(np.arange(pulses.size), np.ones(intervals.size, np.int64), levels)
     if np.all(np.minimum(np.abs(change), np.abs(turn)) <= _REGULAR):
         return every
-    best, cheapest = _most_likely(pulses, scatter, stray)
     unsteady = unsteadiness(levels)
+    best, cheapest = _most_likely(
+        pulses, scatter, stray, limit=math.inf if unsteady else _CHAIN_COST * pulses.size)
     # If both explanations take all pulses for true, the scatter of the speed is the better one.
     if unsteady and ((best is not None and set(best.marks) == {1})
                      or levels.size * (_each(unsteady) + 0.5) < cheapest):
@@ -107,26 +108,32 @@ def _each(scatter: float) -> float:
     return max(math.log(scatter / min(_LADDER)), 0.0)
 
 
-def _most_likely(pulses: FloatArray, scatter: float | None, stray: float
+def _most_likely(pulses: FloatArray, scatter: float | None, stray: float, limit: float
                  ) -> tuple[Path | None, float]:
     """
-    Return the most likely acceptable path of pulses (n,), None without any.
+    Return the most likely acceptable path of pulses (n,) that costs up to `limit`, None without.
 
-    Beside it, the cost of the most likely path of all.
+    Beside it, the cost of the most likely path of all. A search ends where what is left of its
+    paths cannot be the most likely one.
     """
     best, cheapest = None, math.inf
-    for tried in _LADDER if scatter is None else (*_LADDER, scatter):
+    for tried in reversed(_LADDER if scatter is None else (*_LADDER, scatter)):
         rules = PathRules((1,), (1.0,), tried, (0.0,), 1, None, stray=stray, each=_each(tried),
                           most=_MOST_PATHS)
         paths: list[Path] = []
         for number, pulse in enumerate(pulses.tolist()):
-            paths = rules.extend(paths, pulse) if paths else []
-            paths.append(Path(stray * number, pulse, 0, steps=(*(_STRAY,) * number, Step(1))))
+            behind = (pulses.size - 1 - number) * min(stray, rules.each)  # what they cost at least
+            paths = rules.extend(paths, pulse, limit - behind)
+            if stray * number <= limit - behind:
+                paths.append(Path(stray * number, pulse, 0,
+                                  steps=(*(_STRAY,) * number, Step(1))))
+            if not paths:
+                break
         paths.sort(key=itemgetter(0))
-        cheapest = min(cheapest, paths[0].cost)
+        cheapest = min([cheapest, *(path.cost for path in paths[:1])])
         found = next((path for path in paths if _acceptable(path.marks)), None)
         if found is not None and (best is None or found.cost < best.cost):
-            best = found
+            best, limit = found, min(limit, found.cost)
     return best, cheapest
 
 

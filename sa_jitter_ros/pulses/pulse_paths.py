@@ -128,24 +128,30 @@ class PathRules:
     each: float = 0.0
     most: int = _MOST_PATHS
 
-    def extend(self, paths: list[Path], pulse: float) -> list[Path]:
-        """Return the paths with one more pulse, the most likely first."""
-        found = []
+    def extend(self, paths: list[Path], pulse: float, limit: float = math.inf) -> list[Path]:
+        """Return the paths with one more pulse that cost up to `limit`, the most likely first."""
+        found: list[Path] = []
         for path in paths:
-            found.append(path._replace(
-                cost=path.cost + self.stray, steps=(*path.steps, _STRAY), stray_at=pulse))
-            if pulse > path.last:
-                found += self._true(path, pulse)
-        found.sort(key=itemgetter(0))
-        most = found[0].cost + _DROPPED
-        return [path for path in found[:self.most] if path.cost <= most]
+            if path.cost + self.stray <= limit:
+                found.append(path._replace(
+                    cost=path.cost + self.stray, steps=(*path.steps, _STRAY), stray_at=pulse))
+            if pulse > path.last and path.cost + self.each <= limit:
+                found += self._true(path, pulse, limit)
+            if found:  # a path that costs more than those that are kept is not looked at
+                found.sort(key=itemgetter(0))
+                del found[self.most:]
+                limit = min(limit, found[0].cost + _DROPPED,
+                            found[-1].cost if len(found) == self.most else limit)
+        return [path for path in found if path.cost <= limit]
 
-    def _true(self, path: Path, pulse: float) -> Iterator[Path]:
-        """Yield the paths on which the next pulse (s) is true."""
+    def _true(self, path: Path, pulse: float, limit: float) -> Iterator[Path]:
+        """Yield the paths on which the next pulse (s) is true, most of which cost up to `limit`."""
         gap = pulse - path.last
         expected = list(self._expected(path))
         width, passed, slot = 0.0, path.passed, path.slot
         for mark in range(1, 2 + self.maximum_missing):
+            if mark > 1 and path.cost + MISSING + MORE_MISSING * (mark - 2) + self.each > limit:
+                break
             width += self.widths[slot]
             passed += self.steps[slot]
             slot = (slot + 1) % len(self.steps)
@@ -154,7 +160,7 @@ class PathRules:
             jumps = cost == JUMP
             if mark > 1 and not jumps:
                 cost += MISSING + MORE_MISSING * (mark - 2) + self._by_chance(path, gap / width)
-            if mark == 1 or not jumps:
+            if (mark == 1 or not jumps) and path.cost + cost + self.each <= limit:
                 true = path._replace(
                     cost=path.cost + cost + self.each, last=pulse, slot=slot, passed=passed,
                     steps=(*path.steps, Step(mark, level, off, jumps)))

@@ -75,6 +75,7 @@ class PulseStart:
         self._target, self._queue, self._options = target, queue, options
         self._verdicts = verdicts
         self._candidate: Lock | None = None
+        self._looked = False  # whether it is the speed of the candidate that scatters
         self._tried = 0  # pulses of the queue that were tried to match
         #: matches that found nothing, or were lost soon: the next waits longer
         self.failed = 0
@@ -104,7 +105,7 @@ class PulseStart:
                 found = found or self._repeating(lock, queue[:2 * wanted], doubtful=True)
             lock = found or self._rehearsed(lock, queue[:wanted])
         self._drop(lock.first)
-        self._candidate, self._tried = None, 0
+        self._candidate, self._looked, self._tried = None, False, 0
         return lock
 
     def drop_later(self) -> None:
@@ -131,12 +132,14 @@ class PulseStart:
                 self._drop(excess)
                 queue = queue[excess:]
         lock = self._candidate
-        if (lock.scatter > _ROUGH and not lock.unsteady and not self._options.tolerance
+        if (lock.scatter > _ROUGH and not self._looked and not self._options.tolerance
                 and isinstance(self._target, EvenTarget)):
             # It may be the speed that scatters, which more pulses show.
             if queue.size < UNSTEADY and not final:
                 return None
-            lock = self._target.unsteady(queue[:UNSTEADY]) or lock
+            self._looked = True
+            if not lock.unsteady:
+                lock = self._target.unsteady(queue[:UNSTEADY]) or lock
         return lock
 
     def _drop(self, count: int) -> None:
