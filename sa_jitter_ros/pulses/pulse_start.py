@@ -16,6 +16,7 @@ with several marks is learnt for four revolutions, so that the uneven angles bet
 known before the first pulse is judged; none is lost.
 """
 
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 import math
 
@@ -74,11 +75,12 @@ class PulseStart:
                  verdicts: Verdicts) -> None:
         self._target, self._queue, self._options = target, queue, options
         self._verdicts = verdicts
-        self._candidate: Lock | None = None
-        self._looked = False  # whether it is the speed of the candidate that scatters
         self._tried = 0  # pulses of the queue that were tried to match
         #: matches that found nothing, or were lost soon: the next waits longer
         self.failed = 0
+        self._end: End | None = None
+        self._final = False
+        self._locks = self._search()
 
     def find(self, end: End | None, *, final: bool) -> Lock | None:
         """
@@ -86,60 +88,60 @@ class PulseStart:
 
         The sequence before, if any, had this `end`. If no pulse follows, they are `final`.
         """
-        queue = np.array(self._queue)
-        lock = self._chosen(queue, end, final)
-        if lock is None:
-            return None
-        lock = self._candidate = self._at_known_speed(lock, end)
-        if lock.steps.size > 1:
-            wanted = lock.first + 1 + min(
-                REVOLUTIONS * lock.steps.size, math.ceil(_LONGEST / lock.interval))
-            queue = np.array(self._queue)
-            if queue.size < wanted and not final:
-                return None
-            found = None
-            if isinstance(self._target, EvenTarget) and self._target.marks <= _FEW_MARKS:
-                found = self._repeating(lock, queue[:wanted], doubtful=False)
-                if found is None and queue.size < 2 * wanted and not final:
-                    return None
-                found = found or self._repeating(lock, queue[:2 * wanted], doubtful=True)
-            lock = found or self._rehearsed(lock, queue[:wanted])
-        self._drop(lock.first)
-        self._candidate, self._looked, self._tried = None, False, 0
-        return lock
+        self._end, self._final = end, final
+        return next(self._locks)
 
     def drop_later(self) -> None:
         """Take note that the latest pulses were taken away."""
         self._tried = min(self._tried, len(self._queue))
 
-    def _chosen(self, queue: FloatArray, end: End | None, final: bool) -> Lock | None:
-        """Return a lock on the pulses of the queue (n,), None if there are too few to fit one."""
+    def _search(self) -> Iterator[Lock | None]:
+        """Yield locks, each on the first pulses, and None as often as more pulses are needed."""
+        while True:
+            lock = yield from self._chosen()
+            lock = self._at_known_speed(lock)
+            if lock.steps.size > 1:
+                wanted = lock.first + 1 + min(
+                    REVOLUTIONS * lock.steps.size, math.ceil(_LONGEST / lock.interval))
+                pulses, found = (yield from self._first(wanted)), None
+                if isinstance(self._target, EvenTarget) and self._target.marks <= _FEW_MARKS:
+                    found = self._repeating(lock, pulses, doubtful=False)
+                    if found is None:
+                        found = self._repeating(
+                            lock, (yield from self._first(2 * wanted)), doubtful=True)
+                lock = found or self._rehearsed(lock, pulses)
+            self._drop(lock.first)
+            self._tried = 0
+            yield lock
+
+    def _first(self, count: int) -> Generator[None, None, FloatArray]:
+        """Return so many of the first pulses; yield until they are there, or no more follow."""
+        while len(self._queue) < count and not self._final:
+            yield None
+        return np.array(self._queue[:count])
+
+    def _chosen(self) -> Generator[None, None, Lock]:
+        """Return a lock on the pulses of the queue; yield while there are too few to fit one."""
+        lock, end = None, self._end
         scatter = None if end is None or end.unsteady else end.scatter
-        while self._candidate is None:
+        while lock is None:
+            queue = np.array(self._queue)
             size = self._target.next_size(
                 queue, self._tried, self.failed, known=scatter is not None)
-            if size > queue.size:
-                if not final or self._tried >= queue.size:
-                    if final:
-                        self._drop(queue.size)
-                    return None
-                size = queue.size
-            self._tried = size
-            self._candidate = self._target.lock(queue[:size], scatter)
-            self.failed += self._candidate is None
-            excess = size - self._target.memory
-            if self._candidate is None and excess > 0:
-                self._drop(excess)
-                queue = queue[excess:]
-        lock = self._candidate
-        if (lock.scatter > _ROUGH and not self._looked and not self._options.tolerance
+            if size > queue.size and not (self._final and self._tried < queue.size):
+                if self._final:
+                    self._drop(queue.size)
+                yield None
+                continue
+            self._tried = min(size, queue.size)
+            lock = self._target.lock(queue[:self._tried], scatter)
+            self.failed += lock is None
+            if lock is None:
+                self._drop(max(self._tried - self._target.memory, 0))
+        if (lock.scatter > _ROUGH and not lock.unsteady and not self._options.tolerance
                 and isinstance(self._target, EvenTarget)):
             # It may be the speed that scatters, which more pulses show.
-            if queue.size < UNSTEADY and not final:
-                return None
-            self._looked = True
-            if not lock.unsteady:
-                lock = self._target.unsteady(queue[:UNSTEADY]) or lock
+            lock = self._target.unsteady((yield from self._first(UNSTEADY))) or lock
         return lock
 
     def _drop(self, count: int) -> None:
@@ -154,8 +156,9 @@ class PulseStart:
                 f'the first {limit} pulses fit no target of {marks} marks as declared: is it '
                 'noise, or another target? check_keyphasor finds its marks and their angles')
 
-    def _at_known_speed(self, lock: Lock, end: End | None) -> Lock:
+    def _at_known_speed(self, lock: Lock) -> Lock:
         """Return the lock with the interval before, if its own is twice, thrice, ... as long."""
+        end = self._end
         if end is None or not lock.even:
             return lock
         longer = lock.interval / math.exp(end.level)
