@@ -19,10 +19,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
+from sa_jitter_ros.commands import average
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.nodes import messages, playback, recording_player
 from sa_jitter_ros.nodes.playback import Pacer
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
+from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.recordings import ArraySource, Recording, write_npz
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
@@ -370,6 +372,25 @@ def test_unusable_parameters_are_refused(bench, parameters, error, message):
 def test_keyphasor_that_the_recording_lacks_is_refused(bench, recording):
     with pytest.raises(ParameterError, match='the recording contains waveform, reference'):
         bench(replace(recording, pulse_times=None), tach='pulses')
+
+
+def test_a_target_that_no_averager_takes_is_refused_as_there(
+        recording, tmp_path, capfd, monkeypatch):
+    message = 'target_angles has 2 angles for a target of 7 marks: give one for each, in rad'
+    write_npz(tmp_path / 'rig.npz', replace(recording, pulses_per_revolution=7))
+    file = tmp_path / 'machine.yaml'
+    file.write_text(section_text('synchronous_averager', {
+        'pulses_per_revolution': 7, 'target_geometry': 'given', 'target_angles': [0.1, -0.1]}))
+    assert average.main([str(tmp_path / 'rig.npz'), '--params', str(file), '--output',
+                         str(tmp_path / 'out'), '--quiet']) == 2
+    assert message in capfd.readouterr().err
+    monkeypatch.setattr('sys.argv', [
+        'recording_player', '--ros-args', '-p', f'recording:={tmp_path / "rig.npz"}',
+        '--params-file', str(file)])
+    assert recording_player.main() == 2
+    said = capfd.readouterr().err
+    assert f'error: {message}' in said
+    assert said.count('\n') == 1
 
 
 def test_main_ends_with_one_line_on_bad_input(capfd):

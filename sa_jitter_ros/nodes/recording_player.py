@@ -25,6 +25,7 @@ from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.parameters import parameter_files
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import fixed, Parameter
+from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import usable_channels
 from sa_jitter_ros.recordings.channel_units import in_units, scale_of
@@ -72,6 +73,8 @@ class RecordingPlayer(PlaybackNode):
         recording, remarks = usable_channels(recording)
         for path in parameter_files(node_kwargs.get('cli_args') or sys.argv):
             recording = on_target(recording, path)
+        # A target that no averager takes is not played.
+        PulseValidator(pulses_per_revolution=recording.pulses_per_revolution, **recording.target)
         self._recording = recording
         self._pulse_times, self._with_waveform = keyphasor_of(recording, values['tach'])
         for remark in (*remarks, *doubts(
