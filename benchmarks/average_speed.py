@@ -20,7 +20,6 @@ as those of an installed package.
 """
 
 import argparse
-from collections.abc import Sequence
 import os
 from pathlib import Path
 import resource
@@ -49,8 +48,8 @@ def recording(seconds: float) -> Recording:
                      RATE, pulse_times=machine.pulses(0.0, seconds).times)
 
 
-def cpu_seconds(arguments: Sequence[str], folder: str) -> float:
-    """Return the CPU time of a process of Python, which keeps compiled modules in a folder."""
+def cpu_seconds(*arguments: str) -> float:
+    """Return the CPU time of a process of Python, which keeps compiled modules."""
     def used() -> float:
         children = resource.getrusage(resource.RUSAGE_CHILDREN)
         return children.ru_utime + children.ru_stime
@@ -58,7 +57,7 @@ def cpu_seconds(arguments: Sequence[str], folder: str) -> float:
     before = used()
     subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL, env={
         **os.environ, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT),
-        'PYTHONDONTWRITEBYTECODE': '', 'PYTHONPYCACHEPREFIX': f'{folder}/compiled'})
+        'PYTHONDONTWRITEBYTECODE': ''})
     return used() - before
 
 
@@ -68,12 +67,12 @@ def measured(seconds: float, rounds: int) -> dict[str, float]:
         write_npz(Path(folder, 'rig.npz'), recording(seconds))
 
         def average(correct: str, number: int) -> float:
-            return cpu_seconds((
+            return cpu_seconds(
                 '-m', 'sa_jitter_ros.commands.average', f'{folder}/rig.npz', '--params',
                 str(ROOT / 'config' / 'machine.yaml'), '-p', f'correct_jitter:={correct}',
-                '--output', f'{folder}/{correct}{number}', '--no-figures', '--quiet'), folder)
+                '--output', f'{folder}/{correct}{number}', '--no-figures', '--quiet')
 
-        turns = [(cpu_seconds(('-c', 'import sa_jitter_ros.commands.average'), folder),
+        turns = [(cpu_seconds('-c', 'import sa_jitter_ros.commands.average'),
                   average('false', number), average('true', number)) for number in range(rounds)]
     return dict(zip(('start', 'average', 'corrected'), map(min, zip(*turns))))
 

@@ -159,14 +159,15 @@ def gear_train(ratios: list[float], *, channels: int, seconds: float) -> Record:
 def shares(scale: float, rounds: int) -> dict[str, float]:
     """Return the CPU time of settings that ask much, in seconds for a second of data."""
     seconds = max(4.0 * scale, 2.0)
+    many, shafts, channels = (max(round(count * min(scale, 1.0)), 2) for count in (20, 12, 24))
     rate, speed, marks = 100e3, 50.0, 1024
     angle = speed * np.arange(round(seconds * rate)) / rate
     pulses = np.arange(1.0, np.floor(angle[-1] * marks)) / (speed * marks)
     encoder = Record((np.cos(40.0 * np.pi * angle))[None], np.empty((0, 1)), pulses,
                      np.empty(0), rate, 1.0, (20.0,))
     gearbox = make_record(seconds=seconds)
-    ratios = [0.37 + 0.231 * k + 0.00013 * (k % 2) for k in range(20)]
-    train = gear_train(ratios[:12], channels=24, seconds=seconds)
+    ratios = [0.37 + 0.231 * k + 0.00013 * (k % 2) for k in range(many)]
+    train = gear_train(ratios[:shafts], channels=channels, seconds=seconds)
 
     def of_encoder() -> None:
         keyphasor = KeyphasorParameters(pulses_per_revolution=marks, pulses_per_trigger=1)
@@ -184,16 +185,16 @@ def shares(scale: float, rounds: int) -> dict[str, float]:
             f'shaft{k}': AverageSettings(
                 cycle_length=ratio, trigger_cycles=40, orders=(1.0, 19.0, 38.0),
                 correct_jitter=correct, keyphasor_rate=CLOCK)
-            for k, ratio in enumerate(ratios[:12])})
+            for k, ratio in enumerate(ratios[:shafts])})
 
     timings = interleaved({
         f'encoder of {marks} pulses at {speed:g} Hz, each a trigger cycle; 1 channel at '
         f'{rate / 1e3:g} kHz': of_encoder,
-        f'{len(ratios)} shafts of different ratios; 8 channels at {gearbox.rate / 1e3:g} kHz':
+        f'{many} shafts of different ratios; 8 channels at {gearbox.rate / 1e3:g} kHz':
             of_shafts,
-        f'12 shafts of different ratios; 24 channels at {RATE / 1e3:g} kHz':
+        f'{shafts} shafts of different ratios; {channels} channels at {RATE / 1e3:g} kHz':
             partial(of_train, False),
-        '12 shafts; 24 channels, with correction every 40 trigger cycles':
+        f'{shafts} shafts; {channels} channels, with correction every 40 trigger cycles':
             partial(of_train, True)}, rounds=rounds)
     return {name: timing.best / seconds for name, timing in timings.items()}
 

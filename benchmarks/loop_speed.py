@@ -46,7 +46,7 @@ KEYPHASOR_RATE = 5000.0  # Hz
 LOOPS = (31.25, 10000.0, (1.0, 0.8, 0.6, 0.4), 1), (100.0, 25600.0, (1.0, 0.8, 0.6), 1), (
     100.0, 25600.0, (1.0, 0.8, 0.6), 2)
 _RUNS = 5  # of `close_loop`, of which the least counts
-_SHORTEST = 8.0  # s, of a recording: six acquisitions of the model
+_SHORTEST = 5.5  # s, of a recording: four acquisitions of the model
 MODEL = f"""\
 jitter_predictor:
   ros__parameters:

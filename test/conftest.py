@@ -48,6 +48,12 @@ def rng():
     return np.random.default_rng(20240229)
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave figures blank: to draw those of a report takes as long as the report."""
+    monkeypatch.setattr('matplotlib.figure.Figure.draw', lambda figure, renderer: None)
+
+
 @pytest.fixture(scope='session')
 def shared_data():
     """Return the folder of the measured recordings, or skip the test where it is missing."""

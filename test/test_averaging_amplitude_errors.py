@@ -136,7 +136,7 @@ def test_errors_of_a_sideband_hold_what_jitter_leaks_into_the_mean(count, turn, 
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 def test_corrected_errors_are_the_distance_from_the_truth():
     """Also of the phase, which the mean of the pulse errors turns, and which no one can know."""
-    rng, trials, count = np.random.default_rng(4), 120, 10
+    rng, trials, count = np.random.default_rng(4), 80, 10
     orders, size = np.array([8.0, 16.0, 21.0, 11.0]), np.array([0.5, 1.0, 0.04, 0.0])
     rate, speed, clock = 4000.0, 25.0, 1200.0
     times = np.arange(round(17 / speed * rate)) / rate

@@ -85,7 +85,7 @@ def assert_same(found, expected):
                     rtol=1e-9, atol=1e-11, err_msg=f'{name} {key}')
 
 
-@pytest.mark.parametrize('examples', [5, pytest.param(25, marks=pytest.mark.machines)])
+@pytest.mark.parametrize('examples', [5, pytest.param(12, marks=pytest.mark.machines)])
 def test_averages_are_the_same_for_every_cut_and_order_of_arrival(examples):
     @settings(max_examples=examples)
     @given(st.data())

@@ -15,6 +15,7 @@ How fast they find the package depends on what else the machine does: no test as
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 import importlib
 import json
 import os
@@ -26,6 +27,8 @@ import sys
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.recordings import ArraySource, read
+from sa_jitter_ros.recordings.npz_format import write_npz
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'benchmarks'
@@ -79,12 +82,12 @@ def test_a_corrected_amplitude_is_no_worse_and_not_biased(benchmark, values):
 @pytest.mark.machines
 def test_intervals_of_corrected_amplitudes_hold_in_many_settings(benchmark):
     """
-    Over all settings together to 3 points, each within the error of few averages.
+    Over all settings together to 3 points, each within the error of very few averages.
 
     Lines of another shaft that a few cycles do not tell make intervals too safe;
     `test_averaging_other_lines.py` has more of these.
     """
-    campaign, trials = benchmark('interval_coverage'), 10
+    campaign, trials = benchmark('interval_coverage'), 6
     inside = np.zeros((2, 0))
     for number, setting in enumerate(campaign.SETTINGS):
         if setting.another_shaft and setting.ratio != 1.0:
@@ -126,7 +129,10 @@ def test_recordings_with_different_keyphasors_share_one_scale(benchmark, tmp_pat
 @pytest.mark.campaign
 def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, tmp_path):
     scale = benchmark('fleet_scale')
-    found = scale.gearbox(shared_data / 'gear0_gearbox.npz', (3300.0, 9100.0), tmp_path)
+    whole, path = read(shared_data / 'gear0_gearbox.npz'), tmp_path / 'gear0.npz'
+    write_npz(path, replace(whole, vibration=ArraySource(whole.read()[:2]), channel_names=(),
+                            units=()))
+    found = scale.gearbox(path, (3300.0, 9100.0), tmp_path)
     for item in found.values():
         assert np.all(np.abs(item.corrected - item.true) < 4.0 * item.error)
     slow, fast = found['3300 Hz', 46.0], found['9100 Hz', 46.0]
@@ -138,7 +144,7 @@ def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, 
 @pytest.mark.machines
 @pytest.mark.parametrize('cycles', [5, 10])
 def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
-    coverage, trials = benchmark('interval_coverage'), 400
+    coverage, trials = benchmark('interval_coverage'), 200
     raw, _ = coverage.coverage(coverage.Case(cycles, 40.0, 0.8, correct=False), trials, seed=1)
     # of few cycles in so large a jitter they are too safe, by up to 10 points (docs/theory.md)
     for width, wanted, safe in ((1.0, 0.683, 0.1), (1.96, 0.95, 0.03)):
@@ -161,7 +167,7 @@ def test_drawn_strong_amplitudes_are_those_that_are_predicted(benchmark, uniform
 
 @pytest.mark.campaign
 def test_average_is_timed_as_a_user_starts_it(benchmark):
-    found = benchmark('average_speed').measured(4.0, 1)
+    found = benchmark('average_speed').measured(3.0, 1)
     assert found.keys() == {'start', 'average', 'corrected'}
     assert min(found.values()) > 0.0
 
@@ -249,6 +255,7 @@ def test_page_without_a_section_is_refused(benchmark):
 
 
 @pytest.mark.campaign
+@pytest.mark.usefixtures('undrawn')
 def test_measured_cases_are_run_as_a_user_does(benchmark, tmp_path):
     cases, machines = benchmark('measured_cases'), benchmark('trace_confusion')
     taken = machines.recording(machines.machine((), seed=1), 8.1)
@@ -275,7 +282,7 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
     page = tmp_path / 'reliability.md'
     page.write_text((ROOT / 'docs' / 'reliability.md').read_text())
     done = subprocess.run(
-        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '4', '--seed', '3', '--numbers',
+        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '2', '--seed', '3', '--numbers',
          tmp_path / 'faults.json', '--page', page, '--figures', tmp_path], capture_output=True,
         env={**process_environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)}, text=True,
         check=False)
@@ -285,9 +292,9 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
     late = [item for item in found['wrong'] if 'no average after' in item]
     assert found['wrong'] == late, done.stdout + done.stderr
     assert not found['died']
-    assert sum(found['faults'].values()) > 30
-    assert min(found['averages'].values()) > 10
-    assert found['corrected']['corrected'] > 5
+    assert sum(found['faults'].values()) > 15
+    assert min(found['averages'].values()) > 5
+    assert found['corrected']['corrected'] > 2
     assert f'**failed checks: {len(late)}**' in page.read_text()
     assert (tmp_path / 'reliability-faults.png').exists()
 
@@ -343,7 +350,7 @@ def test_soak_follows_memory_and_writes_its_page(process_environment, tmp_path):
 @pytest.mark.campaign
 def test_months_of_averages_are_simulated(benchmark):
     monitor = benchmark('change_monitor')
-    found, years = monitor.false_alarms(monitor.CASES[0], 24, 0.5, seed=1)
+    found, years = monitor.false_alarms(monitor.CASES[0], 24, 0.25, seed=1)
     assert years == pytest.approx(2.0, rel=0.01)
     assert found <= years + 4.0 * np.sqrt(years)
     faults = [*monitor.detections(30, seed=2, months=5)]
@@ -362,5 +369,6 @@ def test_a_damaged_recording_ends_in_one_line_or_with_a_report(benchmark, capsys
 @pytest.mark.machines
 def test_the_loop_counts_marks_alike_in_recordings_that_begin_at_any_of_them(benchmark, capsys):
     compare = benchmark('channels_and_cuts')
-    assert compare.main(['--effects', 'target_geometry', '--machines', '1']) == 0
+    assert compare.main([
+        '--effects', 'target_geometry', '--machines', '1', '--first', '40087']) == 0
     assert 'cut: 1 of 1 alike' in capsys.readouterr().out

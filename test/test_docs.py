@@ -358,6 +358,7 @@ DAY = '## 9. A day with an own gearbox'
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_a_day_with_an_own_gearbox_can_be_spent(capsys, ros_graph):
     """All of its commands run, in their order, and print what is shown."""
     begins = TUTORIAL.read_text(encoding='utf-8').splitlines().index(DAY)

@@ -725,6 +725,7 @@ def saved(folder, recording):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_command_writes_the_report(tmp_path, capsys):
     arguments = saved(tmp_path, simulated(*make_effects({'clock_skew': {'skew': 4e-4}}),
                                           acquisitions=10))

@@ -251,15 +251,14 @@ def test_declared_speed_does_not_enter_what_is_fitted():
     """Fit and prediction share the measured speed; the report keeps the declared one."""
     recording, model = geared(4, 1)
     late = delayed(recording, [2e-4, -1e-4, 0.0, -1e-4])
-    right, *others = (traced(late, replace(model, trigger_speed=share * model.trigger_speed))
-                      for share in (1.0, 1.08, 0.92))
-    for share, found in zip((1.08, 0.92), others):
-        (finding,), (expected,) = found.findings, right.findings
-        np.testing.assert_allclose(finding.effect.pulse_angles, expected.effect.pulse_angles)
-        assert found.after.rms == pytest.approx(right.after.rms)
-        content = report(found)
-        assert content['declared']['trigger_speed'] == share * SPEED / 4
-        assert content['measured_speed'] == pytest.approx(SPEED / 4, rel=1e-4)
+    right, found = (traced(late, replace(model, trigger_speed=share * model.trigger_speed))
+                    for share in (1.0, 1.08))
+    (finding,), (expected,) = found.findings, right.findings
+    np.testing.assert_allclose(finding.effect.pulse_angles, expected.effect.pulse_angles)
+    assert found.after.rms == pytest.approx(right.after.rms)
+    content = report(found)
+    assert content['declared']['trigger_speed'] == 1.08 * SPEED / 4
+    assert content['measured_speed'] == pytest.approx(SPEED / 4, rel=1e-4)
 
 
 def test_gap_turns_by_whole_cycles_whatever_the_speed():

@@ -90,7 +90,7 @@ def values(check, *names):
 @pytest.mark.parametrize(('marks', 'missing', 'late', 'drift'), [
     (1, (), None, 0.01), (1, (), None, 2.0), (2, (), (0.01, -0.01), 0.01),
     (2, (), (0.3, -0.3), 0.01), (8, (), 3e-3, 2.0),
-    (36, (35,), None, 2.0), (36, (34, 35), None, 0.01), (36, (16, 31, 32), None, 0.5),
+    (36, (35,), None, 2.0), (36, (16, 31, 32), None, 0.5),
     (60, (58, 59), 1e-3, 0.01), (4, (3,), None, 0.01), (4, (2, 3), None, 0.01),
     (3, (2,), None, 1.0)])
 def test_target_strays_and_lost_pulses(rng, marks, missing, late, drift):
@@ -314,9 +314,10 @@ def test_strays_alone_are_no_wheel(rng, count):
 @pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'missing'), [(1, ()), (8, ()), (36, (35,))])
 def test_a_wheel_with_a_fifth_lost_and_as_many_strays_is_one(rng, marks, missing):
-    pulses, *_ = tach(rng, marks, missing=missing, lost=0.2)
+    pulses = tach(rng, marks, missing=missing, lost=0.2)[0][:2000]
     strays = rng.uniform(pulses[0], pulses[-1], pulses.size // 5)
-    assert checked(vibration(rng), np.sort(np.append(pulses, strays))).findings
+    samples = vibration(rng)[:, :int(RATE * pulses[-1])]
+    assert checked(samples, np.sort(np.append(pulses, strays))).findings
 
 
 @pytest.mark.parametrize(('factor', 'wrong'), [(0.5, 2), (2.0, 1)])
@@ -392,7 +393,9 @@ def test_delay_is_not_given_where_orders_disagree(rng):
 ])
 def test_measured_machines(shared_data, name, marks, missing, clock, speed):
     """Nothing is declared: neither marks nor orders."""
-    check = check_keyphasor(read(shared_data / f'{name}.npz', pulses_per_revolution=1, orders=[]))
+    recording = read(shared_data / f'{name}.npz', pulses_per_revolution=1, orders=[])
+    check = check_keyphasor(replace(recording, vibration=ArraySource(recording.read()[:2]),
+                                    channel_names=(), units=()))
     assert values(check, 'pulses_per_revolution', 'missing_teeth') == (marks, missing)
     assert check.findings['speed'].value['mean'] == pytest.approx(speed, rel=0.005)
     assert check.findings['clock_rate'].value == (clock and pytest.approx(clock, rel=1e-6))
@@ -413,8 +416,8 @@ def test_measured_engines(shared_data, name, missing):
 @pytest.mark.parametrize(('ripple', 'late'), [(3.4, 0.0), (0.5, 0.0), (0.0, 2.0), (0.0, 0.5)])
 def test_the_vibration_tells_uneven_marks_from_a_speed_that_ripples(ripple, late):
     """The pulses of both are alike; degrees. A crank gets trigger cycles from mark to mark."""
-    rng, rate, teeth, missing = np.random.default_rng(3), 20e3, 60, 2
-    time = np.arange(round(16 * rate)) / rate
+    rng, rate, teeth, missing = np.random.default_rng(3), 5e3, 60, 2
+    time = np.arange(round(12 * rate)) / rate
     even = 5.0 * time + 0.01 * np.sin(2.0 * np.pi * 0.3 * time)
     angle = even + ripple / 360.0 * np.sin(4.0 * np.pi * even)
     number = np.arange(1, int(angle[-1] * teeth))

@@ -11,8 +11,10 @@
 """What `check_keyphasor` writes, `average` and `close_loop` take."""
 
 from dataclasses import replace
+from functools import cache
 import json
 import re
+from shutil import copytree
 from types import SimpleNamespace
 import warnings
 
@@ -29,6 +31,9 @@ from sa_jitter_ros.keyphasor_check.vibration import path_delay
 from sa_jitter_ros.offline.average_recording import average_file, AverageJob
 from sa_jitter_ros.offline.settings import averager_values, MachineFile
 from sa_jitter_ros.recordings import ArraySource, read
+from sa_jitter_ros.recordings.npz_format import write_npz
+
+pytestmark = pytest.mark.usefixtures('undrawn')
 
 RATE = 5120.0
 
@@ -53,10 +58,23 @@ def write_rig(path, *, turns, marks=1, missing=0, edges=None, speed=20.0, torsio
                         + 0.05 * rng.normal(size=time.size)])
 
 
-def run_all(path, folder, capsys, change=None):
-    """Run the three commands; return the text that the last two print, and the report."""
-    machine = str(folder / 'machine.yaml')
-    assert check_keyphasor.main([str(path), '--output', str(folder), '--quiet']) == 0
+@pytest.fixture(scope='module')
+def checked(tmp_path_factory):
+    """Return the function that writes a rig, checks it, and returns its folder, once for each."""
+    @cache
+    def of(turns, **options):
+        folder = tmp_path_factory.mktemp('checked')
+        write_rig(folder / 'rig.npz', turns=turns, **options)
+        assert check_keyphasor.main([
+            str(folder / 'rig.npz'), '--output', str(folder), '--quiet']) == 0
+        return folder
+
+    return of
+
+
+def run_all(folder, capsys, change=None):
+    """Average and close the loop; return the text that both print, and the report."""
+    path, machine = folder / 'rig.npz', str(folder / 'machine.yaml')
     if change is not None:
         change(folder / 'machine.yaml')
     capsys.readouterr()
@@ -69,9 +87,8 @@ def run_all(path, folder, capsys, change=None):
 
 @pytest.mark.machines
 @pytest.mark.parametrize(('turns', 'marks'), [(9, 6), (9, 1)])
-def test_a_short_recording_is_averaged_and_says_what_is_too_short(tmp_path, capsys, turns, marks):
-    write_rig(tmp_path / 'rig.npz', turns=turns, marks=marks)
-    text, report = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
+def test_a_short_recording_is_averaged_and_says_what_is_too_short(checked, capsys, turns, marks):
+    text, report = run_all(checked(turns, marks=marks), capsys)
     assert 'averages of 1 recording' in text
     assert report['verdict'] == 'none'
     reason = report['not_testable'][0]['reason']
@@ -79,9 +96,8 @@ def test_a_short_recording_is_averaged_and_says_what_is_too_short(tmp_path, caps
 
 
 @pytest.mark.machines
-def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(tmp_path, capsys):
-    write_rig(tmp_path / 'rig.npz', turns=48, marks=60, missing=2, torsion=np.radians(3.4))
-    text, _ = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
+def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(checked, capsys):
+    text, _ = run_all(checked(48, marks=60, missing=2, torsion=np.radians(3.4)), capsys)
     assert 'averages of 1 recording' in text
 
 
@@ -98,7 +114,7 @@ def from_mark_to_mark(file):
 @pytest.mark.machines
 @pytest.mark.parametrize('each', [False, True])
 @pytest.mark.parametrize('wheel', ['extra', 'three', 'narrow', 'any', 'nearly even'])
-def test_a_wheel_with_marks_at_any_angles_is_taken(tmp_path, capsys, rng, wheel, each):
+def test_a_wheel_with_marks_at_any_angles_is_taken(checked, tmp_path, capsys, rng, wheel, each):
     """The loop takes the given angles from the pulses, and finds no effect that is none."""
     edges = {
         'extra': np.sort([*np.arange(12) / 12, (rng.integers(12) + rng.uniform(.15, .45)) / 12]),
@@ -107,12 +123,12 @@ def test_a_wheel_with_marks_at_any_angles_is_taken(tmp_path, capsys, rng, wheel,
         'nearly even': (np.arange(8) + rng.uniform(-0.05, 0.05, 8)) / 8}[wheel]
     if wheel == 'any':
         edges = edges[:-1] / edges[-1]
-    write_rig(tmp_path / 'rig.npz', turns=120, edges=edges, jitter=2e-5, orders=(1, 5, 8, 24))
-    text, report = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys,
-                           change=from_mark_to_mark if each else None)
+    folder = copytree(checked(60, edges=tuple(edges), jitter=2e-5, orders=(1, 5, 8, 24)),
+                      tmp_path / 'rig')
+    text, report = run_all(folder, capsys, change=from_mark_to_mark if each else None)
     assert 'averages of 1 recording' in text
     assert (report['verdict'], report['missing_effects'], report['remarks']) == ('none', [], [])
-    table = np.genfromtxt(tmp_path / 'out/averages/averages.csv', delimiter=',', names=True,
+    table = np.genfromtxt(folder / 'averages/averages.csv', delimiter=',', names=True,
                           dtype=None, encoding='utf-8')
     if not each:
         assert np.max(np.abs(table['raw_amplitude'] - 1.0)) < 0.02
@@ -120,7 +136,8 @@ def test_a_wheel_with_marks_at_any_angles_is_taken(tmp_path, capsys, rng, wheel,
 
 @pytest.mark.machines
 @pytest.mark.parametrize('each', [False, True])
-def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(tmp_path, capsys, each):
+def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(
+        checked, tmp_path, capsys, each):
     """Three times the declared jitter, with the size of what is not declared."""
     def change(file):
         if each:
@@ -129,9 +146,9 @@ def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(tmp_path, caps
         assert count == 1
         file.write_text(text)
 
-    write_rig(tmp_path / 'rig.npz', turns=200, edges=[*np.arange(12) / 12, 11.3 / 12],
-              jitter=1.2e-4, orders=(1, 5, 8, 24))
-    _, report = run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys, change)
+    folder = copytree(checked(160, edges=(*np.arange(12) / 12, 11.3 / 12), jitter=1.2e-4,
+                              orders=(1, 5, 8, 24)), tmp_path / 'rig')
+    _, report = run_all(folder, capsys, change)
     effect, = report['missing_effects']
     size = effect['parameters']['std']
     assert effect['name'] == 'excess_jitter'
@@ -140,20 +157,19 @@ def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(tmp_path, caps
 
 @pytest.mark.machines
 @pytest.mark.parametrize('wrong', ['reversed', 'of fewer marks'])
-def test_angles_of_another_wheel_are_named_as_the_cause(tmp_path, capsys, rng, wrong):
+def test_angles_of_another_wheel_are_named_as_the_cause(checked, tmp_path, capsys, rng, wrong):
     edges = np.append(0.0, np.cumsum(rng.uniform(0.3, 1.7, 9)))
     edges = edges[:-1] / edges[-1]
-    write_rig(tmp_path / 'rig.npz', turns=60, edges=edges)
-    assert check_keyphasor.main([str(tmp_path / 'rig.npz'), '--output', str(tmp_path),
-                                 '--quiet']) == 0
+    folder = checked(60, edges=tuple(edges))
     other = np.sort((1.0 - edges) % 1.0) if wrong == 'reversed' else np.delete(edges, 4)
     angles = 2.0 * np.pi * (other - np.arange(other.size) / other.size)
     file = tmp_path / 'machine.yaml'
-    text = re.sub('target_angles: .*', f'target_angles: {angles.tolist()}', file.read_text())
+    text = re.sub('target_angles: .*', f'target_angles: {angles.tolist()}',
+                  (folder / 'machine.yaml').read_text())
     file.write_text(text.replace('revolution: 9', f'revolution: {other.size}'))
     capsys.readouterr()
     for main, declared in ((average.main, '--params'), (close_loop.main, '--declared')):
-        assert main([str(tmp_path / 'rig.npz'), declared, str(file), '--output',
+        assert main([str(folder / 'rig.npz'), declared, str(file), '--output',
                      str(tmp_path / 'out'), '--quiet']) == 2
         said = capsys.readouterr().err
         assert said.count('\n') == 1
@@ -162,11 +178,11 @@ def test_angles_of_another_wheel_are_named_as_the_cause(tmp_path, capsys, rng, w
 
 
 @pytest.mark.machines
-def test_a_file_without_orders_names_none_and_is_taken(tmp_path, capsys):
+def test_a_file_without_orders_names_none_and_is_taken(checked, capsys):
     """It says what to add; averager and predictor take orders of their own meanwhile."""
-    write_rig(tmp_path / 'rig.npz', turns=200, orders=())
-    run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
-    text = (tmp_path / 'out/machine.yaml').read_text()
+    folder = checked(60, orders=())
+    run_all(folder, capsys)
+    text = (folder / 'machine.yaml').read_text()
     assert '# No order is known: add those of interest, as in shaft.orders: [1.0, 2.0], to' in text
     assert text.count('shaft.orders') == 1
 
@@ -201,12 +217,15 @@ RECORDINGS = [
     ('encoder_motor_slow', {})]
 
 
-def cut(recording, seconds):
-    """Return the first seconds of a recording."""
-    vibration = recording.read()[:, :int(seconds * recording.sample_rate)]
-    tach = recording.read_tach()
-    return replace(recording, vibration=ArraySource(vibration), tach=None if not tach.size else
-                   ArraySource(tach[None, :int(seconds * recording.tach_rate)]))
+def cut(recording, seconds, channels=None):
+    """Return the first seconds of a recording, and all or the first channels."""
+    vibration = recording.read()[:channels, :int(seconds * recording.sample_rate)]
+    changes = {} if channels is None else {'channel_names': (), 'units': ()}
+    if recording.pulse_times is not None:
+        changes['pulse_times'] = recording.keyphasor_pulses(duration=seconds)
+    if (tach := recording.read_tach()).size:
+        changes['tach'] = ArraySource(tach[None, :int(seconds * recording.tach_rate)])
+    return replace(recording, vibration=ArraySource(vibration), **changes)
 
 
 @pytest.mark.machines
@@ -216,6 +235,9 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     """Other warnings than those for users, as numpy gives them, are errors in all tests."""
     path = shared_data / f'{name}.npz'
     recording = read(path, pulses_suffice=True, **fields)
+    if recording.channels > 2:  # all of them would be corrected in every average
+        recording, path = cut(recording, 5.0, channels=2), tmp_path / path.name
+        write_npz(path, recording)
     check = keyphasor.check_keyphasor(recording)
     file = tmp_path / 'machine.yaml'
     file.write_text(machine_file(check, path.name))
@@ -230,8 +252,10 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     for model in read_declaration(file, sample_rate=recording.sample_rate).models.values():
         record_pulses(recording, model)
         if recording.samples * recording.channels > 60_000:  # of all the loop is slow
-            recording = cut(recording, 3.5 * model.trigger_cycles * model.trigger_revolutions
-                            / model.trigger_speed)
+            seen = recording.keyphasor_pulses()
+            last = int(2.0 * model.trigger_cycles * model.trigger_revolutions
+                       * model.pulses_per_revolution)
+            recording = cut(recording, seen[min(last, seen.size - 1)] - recording.start_time)
             seen = recording.keyphasor_pulses(duration=recording.duration)
             model = replace(model, trigger_speed=(seen.size - 1) / np.ptp(seen)
                             / model.pulses_per_revolution)

@@ -268,6 +268,7 @@ def test_loop_leaves_out_a_channel_with_gaps(recording):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
     write_npz(tmp_path / 'rig.npz', with_bad_channels(recording))
     (tmp_path / 'model.yaml').write_text('jitter_predictor:\n  ros__parameters:\n' + ''.join(

@@ -106,17 +106,17 @@ def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
 @pytest.mark.machines
 def test_slow_unsteadiness_below_the_noise_is_learnt():
     """What a prediction from the last score misses costs alarms until 32 groups have shown it."""
-    shape, scores = (40, 8), 2000.0
+    shape, scores = (80, 8), 2000.0
     draw = smooth(np.random.default_rng(8), shape, 0.95, 2.0)
     test, unknown, alarms = ChangeTest(shape, learning=40), np.full(shape, np.nan), []
-    for number in range(6000):
+    for number in range(4500):
         changed, _ = test.update(0, draw(), unknown, unknown, (number, number), scores)
         again = changed.any(axis=1)
         alarms.append(int(again.sum()))
         test.active[again] = False
         test.evidence.ratios[:, again] = test.evidence.sums[:, again] = 0.0
     late = sum(alarms[3000:])
-    expected = shape[0] * 3000 / scores
+    expected = shape[0] * 1500 / scores
     # scatter over 256 groups is known to a quarter: twice the rate
     assert late <= 2.0 * expected + 3.0 * np.sqrt(2.0 * expected)
 

@@ -52,7 +52,7 @@ def traced(marks=1, **effects):
         fluctuation=band_limited(std=2e-4, band=(0.1, 2.0), seed=1, name='speed'),
         effects=(DeclaredJitter('uniform', 1.0 / (CLOCK * np.sqrt(12.0))), AdditiveNoise(0.05),
                  *make_effects(effects)))
-    seconds = 12.0
+    seconds = 9.0
     recording = Recording(
         ArraySource(machine.vibration(0, int(seconds * RATE))), RATE, ratio=model.ratio,
         pulse_times=machine.pulses(0.0, seconds).times, channel_names=('<left>', 'right & top'))

@@ -108,6 +108,8 @@ class Memory:
     def __init__(self) -> None:
         """Begin with nothing."""
         self.shown: dict[tuple[tuple[Influence, ...], int], list[_Shown]] = {}
+        #: Means and standard deviations of lines, by effects and acquisitions: they are small.
+        self.predicted: dict[tuple[tuple[Influence, ...], tuple[int, ...]], tuple[Array, ...]] = {}
         self._kept = 0
 
     def make_room(self) -> None:

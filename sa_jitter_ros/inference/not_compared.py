@@ -12,7 +12,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
@@ -34,6 +34,7 @@ from sa_jitter_ros.inference.timing import read_timing, stretches
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.inference.undecided import probabilities, published_change, undecided_effects
 from sa_jitter_ros.inference.unsteady import UnsteadyLine
+from sa_jitter_ros.prediction.prediction import predict, Prediction
 
 UNSEEN = 'nothing of it shows in this recording'
 
@@ -60,8 +61,12 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     tried: list[Candidate] = []
     most = ''
 
+    @cache
+    def predicted(effects: tuple[Effect, ...]) -> Prediction:
+        return predict(observation.model, effects)
+
     def change(others: Sequence[Effect], effect: Effect) -> float:
-        return published_change(observation, others, [*others, effect])
+        return published_change(predicted((*others,)), predicted((*others, effect)))
 
     if bench is None:
         evidence, by_how_much = pulse_evidence(observation), change
@@ -86,8 +91,7 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
                if item.rejected_because and item.finding.effect is not None]
     rows = limits(timing, evidence, [*known, *(item.name for item in (*found, *present))])
     open_ = [row.name for row in rows if row.upper is None and row.lower is None]
-    undecided = tuple(row.name for row in rows if row.name in {
-        *open_, *undecided_effects(by_how_much, declared, rows)})
+    undecided = {*open_, *undecided_effects(by_how_much, declared, rows)}
     names = [item.name for item in found]
     tested = {*names, *(item.name for item in tried)}
     not_testable = {name: reason for name in EFFECTS if name not in tested}
@@ -97,7 +101,7 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
         tuple(present), tuple(without_harmful(tried, harmful)), UNDEFINED, UNDEFINED,
         np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None,
         'unexplained' if left_over else 'traced' if found else 'none', float('nan'),
-        None, None, rows, undecided,
+        None, None, rows, tuple(row.name for row in rows if row.name in undecided),
         probabilities(tried, None, names, not_testable), reason, noise, gain=gained,
         remains=left_over, unsteady=unsteady, not_testable=not_testable,
         clock=NO_CLOCK if bench is None else bench.clock)

@@ -114,14 +114,21 @@ class Bench:
         acquisitions that fit parameters, or of the `chosen` ones. A line counts also if it is not
         compared: what disturbs it is why.
         """
-        without, with_it = (self.expect(known, self.fit if chosen is None else chosen)
-                            for known in ([*others], [*others, effect]))
-        changes = [np.abs(with_it.attenuation - without.attenuation).mean(axis=0)]
-        for name in ('attenuation_variance', 'amplitude_variance'):
-            changes.append(np.abs(np.sqrt(getattr(with_it, name).mean(axis=0))
-                                  - np.sqrt(getattr(without, name).mean(axis=0))))
+        acquisitions = tuple(self.fit if chosen is None else chosen)
+        changes = [np.abs(with_it - without).mean(axis=0) for without, with_it in zip(*(
+            self._predicted(known, acquisitions) for known in (others, [*others, effect])))]
         of_hidden = self.hidden.change(others, effect, chosen) if self.hidden else 0.0
         return max(float(np.max(changes)), of_hidden)
+
+    def _predicted(self, effects: Sequence[Effect], chosen: tuple[int, ...]) -> tuple[Array, ...]:
+        """Return attenuations (acquisition, line), and two standard deviations (1, line)."""
+        key, known = (tuple(self.with_declared(effects)), chosen), self.memory.predicted
+        if key not in known:
+            found = self.expect(effects, chosen)
+            known[key] = found.attenuation, *(
+                np.sqrt(item.mean(axis=0, keepdims=True)) for item in (
+                    found.attenuation_variance, found.amplitude_variance))
+        return known[key]
 
     def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
                unsteadiness: float | Array = 0.0) -> Expectation:

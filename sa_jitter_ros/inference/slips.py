@@ -85,9 +85,8 @@ def _misfits(states: States, cycle: int, one: Array, other: Array, signals: Arra
     end = states.times[cycle + 1] - states.states[cycle + 1, 0] - other[:, None]
     place = begin + (end - begin) * states.u
     left = states.band.at(place) - signals.T
-    for row, tone in zip(states.amplitudes[:, states.orders.size:].T, states.tones):
-        wave = np.exp(2j * np.pi * tone * (place - states.band.start))
-        left -= (row * wave[..., None]).real
+    if states.tones.size:
+        left -= _tones(states, begin[:, 0, 0], end[:, 0])
     left *= np.sqrt(states.weight)
     left = left.reshape(one.size, other.size, -1)
     columns = np.concatenate([states.shapes[1:-2, :, None] * rate.T, signals.T[None]])
@@ -96,3 +95,16 @@ def _misfits(states: States, cycle: int, one: Array, other: Array, signals: Arra
     along = left @ columns.T
     return np.asarray(0.5 * (np.sum(left**2, axis=2)
                              - np.einsum('ijk,kl,ijl->ij', along, known, along)))
+
+
+def _tones(states: States, begin: Array, end: Array) -> Array:
+    """
+    Return the tones (one, other, point, channel) in cycles from `begin` (one,) to `end` (other,).
+
+    A place in a cycle is a sum of a part of either, and so the wave there is a product of two.
+    """
+    u, turn = states.u[:, None, None], 2j * np.pi * states.tones
+    first = np.exp((1.0 - u) * (begin[:, None] - states.band.start) * turn)
+    second = np.exp(u * turn[:, None] * (end - states.band.start))
+    found = (states.amplitudes[:, None, states.orders.size:] * first[:, None]) @ second[:, None]
+    return np.moveaxis(found.real, (0, 1), (2, 3))

@@ -47,6 +47,7 @@ from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Tim
 from sa_jitter_ros.inference.timing_choice import RATIO
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.inference.undecided import probabilities, published_change, undecided_effects
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
 Progress = Callable[[str], None]
@@ -267,9 +268,9 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
         if known:  # measured pulses tell the ticks, which a prediction on line has to know
             certain = {name: effect.values[name]
                        for name, error in finding.standard_errors.items() if error is None}
-            change = max(change, published_change(
-                bench.observation, [*others, known], [*others, make_effect(
-                    known.name, **{**known.values, **certain})]))
+            change = max(change, published_change(*(
+                predict(bench.observation.model, [*others, one]) for one in (known, make_effect(
+                    known.name, **{**known.values, **certain})))))
         finding = replace(finding, largest_change=change)
         if finding.largest_change >= least_change(effect):
             chosen.append(finding)

@@ -20,10 +20,9 @@ from sa_jitter_ros.effects.timing import Pattern
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.limits import EffectLimit
-from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing import Timing
-from sa_jitter_ros.prediction.prediction import predict
+from sa_jitter_ros.prediction.prediction import Prediction
 
 #: The largest change that an effect beside others makes.
 Change = Callable[[Sequence[Effect], Effect], float]
@@ -56,10 +55,8 @@ def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[
     return tuple(found)
 
 
-def published_change(observation: Observation, without: Sequence[Effect],
-                     with_them: Sequence[Effect]) -> float:
-    """Return the largest change by effects of what is published: mean and scatter of an order."""
-    before, after = (predict(observation.model, known) for known in (without, with_them))
+def published_change(before: Prediction, after: Prediction) -> float:
+    """Return the largest change of what is published: mean and scatter of an order."""
     return float(max(np.abs(getattr(after, name) - getattr(before, name)).max()
                      for name in ('mean_attenuation', 'standard_deviation')))
 
