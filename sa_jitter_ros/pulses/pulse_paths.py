@@ -145,7 +145,7 @@ class PathRules:
         return [path for path in found if path.cost <= limit]
 
     def _true(self, path: Path, pulse: float, limit: float) -> Iterator[Path]:
-        """Yield the paths on which the next pulse (s) is true, most of which cost up to `limit`."""
+        """Yield paths on which the next pulse (s) is true: those that cost up to `limit`."""
         gap = pulse - path.last
         expected = list(self._expected(path))
         width, passed, slot = 0.0, path.passed, path.slot
