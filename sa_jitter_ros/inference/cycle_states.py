@@ -240,9 +240,10 @@ class States:
         size = float(np.sqrt(np.mean(self.change**2)))
         if move:
             most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency)
-            nearer = np.diff(self.change) / np.diff(self.times - self.states[:, 0])
-            part = min(1.0, most / max(size, 1e-300),
-                       0.5 / max(float(nearer.max()), 1e-300))  # pulses keep their order
+            # pulses come no nearer to each other than half as far as they were measured
+            room = np.diff(0.5 * self.times - self.states[:, 0])
+            nearer = np.diff(self.change) / np.maximum(room, 1e-300)
+            part = min(1.0, most / max(size, 1e-300), 1.0 / max(float(nearer.max()), 1e-300))
             self.states = self.states + part * change
             self.trend += part * trend
             self._take_out_mean_bend()
