@@ -31,6 +31,7 @@ to the number of pulses.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import factorial, pi
 
 import numpy as np
@@ -169,7 +170,7 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
     u = np.arange(length) / length
     nodes, columns = [], [np.ones((len(u), 1))]
     for g in orders:
-        x, through_nodes = _through_nodes(nodes_for(g * spread), u)
+        x, through_nodes = _through_nodes(nodes_for(g * spread), length)
         wave = np.exp(2j * pi * g * cycle_length * u)[:, None] * through_nodes
         nodes.append(x)
         columns += [wave.real, -wave.imag]
@@ -190,15 +191,18 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
                             start, grid)
 
 
-def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+@lru_cache(maxsize=32)
+def _through_nodes(count: int, length: int) -> tuple[FloatArray, FloatArray]:
     """
     Return Gauss nodes in [0, 1] and the polynomials (u, node) that are 1 at one node each.
 
-    They are sums of Legendre polynomials, for whose products Gauss quadrature is exact.
+    There are `length` values u = i / length. The polynomials are sums of Legendre polynomials, for
+    whose products Gauss quadrature is exact.
     """
     x, weight = legendre.leggauss(count)
     sizes = np.arange(count) + 0.5
     at_nodes = legendre.legvander(x, count - 1) * weight[:, None]
+    u = np.arange(length) / length
     return 0.5 + 0.5 * x, (legendre.legvander(2.0 * u - 1.0, count - 1) * sizes) @ at_nodes.T
 
 
@@ -325,7 +329,8 @@ class PulseErrorProblem:
             converged = np.all(moved < _CONVERGED * np.abs(amplitudes[self.significant]))
             if converged and np.max(np.abs(step)) < 0.02 * np.sqrt(np.min(covariance[0])):
                 break
-        evidence = log_likelihood(information, np.zeros_like(pull), std) + 0.5 * (
+        none = log_likelihood(information, np.zeros_like(pull), np.array([std])).item()
+        evidence = none + 0.5 * (
             self._misfit_without_errors(weight) - np.sum(residual**2)
             - np.sum(errors**2) / std**2
             + np.log(information.times(np.ones(len(pull))).sum()))
@@ -397,20 +402,25 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum('kdc,kdc->k', a, b))
 
 
-def log_likelihood(information: Tridiagonal, right: FloatArray, size: float) -> float:
+def log_likelihood(information: Tridiagonal, right: FloatArray, sizes: FloatArray) -> FloatArray:
     """
-    Return the logarithm of the likelihood of a standard deviation of pulse errors.
+    Return the logarithm of the likelihood of standard deviations (size,) of pulse errors.
 
     Errors e have the likelihood exp(right' e - e' information e / 2) and are independent and
-    normal but for a delay of all, which is unknown.
+    normal but for a delay of all, which is unknown. All sizes make one chain, with no link
+    between them.
     """
-    ones, precision = np.ones(len(right)), size**-2
-    pivots, multipliers = information.plus(precision).pivots()
-    through, common = lapack.dpttrs(pivots, multipliers, np.stack((right, ones), axis=1))[0].T
+    precision = sizes[:, None] ** -2
+    chain = Tridiagonal((information.diagonal + precision).ravel(), np.tile(
+        np.append(information.off_diagonal, 0.0), sizes.size)[:-1])
+    pivots, multipliers = chain.pivots()
+    both = np.stack((np.tile(right, sizes.size), np.ones(pivots.size)), axis=1)
+    through, common = lapack.dpttrs(pivots, multipliers, both)[0].T.reshape(2, sizes.size, -1)
     common = common * precision
-    delay = information.times(ones) @ common
-    return float(0.5 * (right @ through - np.log(pivots / precision).sum()
-                        + (right @ common) ** 2 / delay - np.log(delay)))
+    delay = common @ information.times(np.ones(len(right)))
+    return np.asarray(0.5 * (
+        through @ right - np.log(pivots.reshape(through.shape) / precision).sum(axis=1)
+        + (common @ right) ** 2 / delay - np.log(delay)))
 
 
 def estimated_size(information: Tridiagonal, right: FloatArray, declared: float
@@ -423,6 +433,6 @@ def estimated_size(information: Tridiagonal, right: FloatArray, declared: float
     is the declared size, else the one that maximises the restricted likelihood.
     """
     sizes = declared * _SIZES
-    likelihood = np.array([log_likelihood(information, right, size) for size in sizes.tolist()])
+    likelihood = log_likelihood(information, right, sizes)
     chance = np.exp(likelihood - likelihood.max()) * _CHANCES
     return float(np.exp(np.log(sizes) @ chance / chance.sum()))
