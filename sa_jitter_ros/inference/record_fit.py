@@ -116,8 +116,7 @@ class OpenRecord:
 def _settle(states: States) -> None:
     """Do steps until the pulse errors hardly change: what they leave are lines, and no bends."""
     for _ in range(_MOST_STEPS):
-        unsure = states.size[0] * np.sqrt(1.0 - states.resolved[0])
-        if states.step() < _SETTLED * unsure:
+        if states.step() < _SETTLED * states.size[0] * np.sqrt(1.0 - states.resolved[0]):
             break
 
 
