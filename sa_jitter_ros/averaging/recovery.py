@@ -58,6 +58,7 @@ _AMBIGUOUS = 1.0
 # Amplitudes below this fraction of the RMS of a channel are rounding errors.
 _ROUNDING = 1e-9
 _STAGES = 8
+_STRONGEST = 12  # orders that are looked for
 _MOST_COLUMNS = 400  # of the compression, which takes most of the time
 # Fewer cycles than this do not separate an order from that of another shaft near it; then errors
 # of this many declared standard deviations are refused.
@@ -123,8 +124,8 @@ class _Attempt:
 
 def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length: float,
                          declared_standard_deviation: float, first_angle: float = 0.0,
-                         orders: Sequence[float] = (), additional_orders: Sequence[float] = (),
-                         most_orders: int = 12) -> PulseErrorRecovery:
+                         orders: Sequence[float] = (), additional_orders: Sequence[float] = ()
+                         ) -> PulseErrorRecovery:
     """
     Recover the pulse errors of one average from its vibration.
 
@@ -132,8 +133,7 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     samples of the time between two measured pulses (linear law), and `periods` (cycle,) these
     times (s). `cycle_length` is r, `first_angle` the angle of the first pulse, both in fundamental
     cycles. `declared_standard_deviation` (s) is that of the declared pulse error. `orders` are the
-    orders to use; without it, the `additional_orders` and the strongest of the integer ones are
-    used, of these at most `most_orders` and as many more as there are fractions among the others.
+    orders to use; without it, the `additional_orders` and the strongest of the integer ones are.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
     cycle_length or standard deviation that is not positive.
@@ -157,7 +157,7 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     declared = declared_standard_deviation * cycle_length / float(np.mean(periods))
     found = _likeliest(partial(
         _staged_fit, grid, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
-        additional_orders=additional_orders, most_orders=most_orders, declared=declared), declared)
+        additional_orders=additional_orders, declared=declared), declared)
     problem, fit, reason = found.problem, found.fit, found.reason
     if problem is None or fit is None:
         count, channels = grid.pulses, grid.cycles.shape[2]
@@ -259,8 +259,8 @@ def _whole(cycles: FloatArray) -> bool:
 
 
 def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
-                orders: Sequence[float], additional_orders: Sequence[float], most_orders: int,
-                declared: float, expected: float) -> _Attempt:
+                orders: Sequence[float], additional_orders: Sequence[float], declared: float,
+                expected: float) -> _Attempt:
     """
     Fit low orders first, then higher ones as the errors become better known.
 
@@ -274,7 +274,6 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
     listed = np.unique([g for g in (orders if len(orders) else additional_orders)
                         if 0.0 < g * cycle_length <= 0.5 * len(grid.samples)])
     search = None if len(orders) else LineSearch.of(grid, cycle_length, additional_orders)
-    most = most_orders + sum(g != round(g) for g in set(additional_orders))
     known = listed if search is None else search.orders
     width = _UNIFORM_WIDTH * expected  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
@@ -284,7 +283,7 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         reach = _MOST_TURNS / width
         candidates = listed[listed <= reach]
         if search is not None:
-            strongest, clearest = search.strongest(errors, most, below=reach)
+            strongest, clearest = search.strongest(errors, _STRONGEST, below=reach)
             clear = np.union1d(clear, clearest)
             candidates = np.append(candidates, strongest[~np.isin(strongest, listed)])
             if clearest.size:
