@@ -253,11 +253,6 @@ def _refusal(fit: PulseErrorFit, errors: FloatArray, turned: NDArray[np.bool_], 
     return ''
 
 
-def _whole(cycles: FloatArray) -> bool:
-    """Return whether orders have whole `cycles` in a trigger cycle, and do not leak there."""
-    return bool(np.all(np.abs(cycles - np.rint(cycles)) < _ROUNDING))
-
-
 def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                 orders: Sequence[float], additional_orders: Sequence[float], declared: float,
                 expected: float) -> _Attempt:
@@ -291,7 +286,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                     errors, candidates, cycles=len(grid.cycles))]
         if not len(candidates):
             break
-        leaking = not _whole(np.append(candidates, listed) * cycle_length)
+        cycles = np.append(candidates, listed) * cycle_length
+        leaking = bool(np.any(np.abs(cycles - np.rint(cycles)) > _ROUNDING))
         if leaking:
             candidates = np.append(candidates, np.setdiff1d(listed, candidates))
         room = np.where(np.isin(candidates, (*listed, *clear)), _MOST_COLUMNS,
