@@ -43,7 +43,7 @@ from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
-    Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
+    BAND, Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
 from sa_jitter_ros.inference.timing_data import (
     ALIASES, FEWEST, Stretch)
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
@@ -277,7 +277,7 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding | None:
         effect = _by_angle(effect, fit)
     rivals = tuple(EXCESS if other == JITTER else other for other in choice.rivals(name)
                    if other not in NO_EFFECTS)
-    if RIPPLE in choice.rivals(name):
+    if {RIPPLE, BAND} & {*choice.rivals(name)}:
         rivals = (*rivals, _SPEED)
     return Finding(name, effect, errors, _p_value(choice, name, chooser),
                    _text(choice, name, effect, errors), indistinguishable_from=rivals,

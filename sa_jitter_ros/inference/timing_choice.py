@@ -30,6 +30,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, possible, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
+from sa_jitter_ros.effects.phase_wander import PhaseWander
 from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.effects.timing import (
     FAINT, LARGE, MOTION, Pattern, PULSES, Setting, SOURCE, Spectrum)
@@ -42,11 +43,13 @@ from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
 RIPPLE = 'ripple'
 #: Sidebands that turn all lines by one time: no effect, but a source that moves may look like it.
 SIDEBANDS = 'sidebands'
+#: A speed that varies up to some frequency: no effect, but a source that moves may look like it.
+BAND = 'band'
 #: What a wrong ratio makes beside a clock skew of its size: no effect, but a wrong number.
 RATIO = 'ratio'
 #: Independent errors beside the declared jitter, or that of another size.
 EXCESS = 'excess_jitter'
-NO_EFFECTS = RIPPLE, SIDEBANDS, RATIO
+NO_EFFECTS = RIPPLE, SIDEBANDS, BAND, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
 _STEP = 0.01  # of the tick by which the size of a pattern is varied, to either side
@@ -119,6 +122,7 @@ class Chooser:
             self.patterns[RIPPLE] = Pattern(lambda setting: np.zeros((0, 0))), marks
         self.spectra = {name: kind.timing for name, kind in EFFECTS.items()
                         if isinstance(kind.timing, Spectrum)}
+        self.spectra[BAND] = replace(PhaseWander.timing, direction=MOTION)
         lines = np.unique(np.concatenate([item.sidebands for item in stretches]))
         if lines.size:
             self.spectra[SIDEBANDS] = Spectrum(
