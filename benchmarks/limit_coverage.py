@@ -61,20 +61,23 @@ def machine(seed: int | Sequence[int], *, count: int = _COUNT, scale: float = 1.
             excess: float = 0.0, rho: float = 0.0, wander: float = 0.0, skew: float = 0.0,
             marks: Sequence[float] | None = None, delay: float = 0.0, shocks: float = 0.0,
             hum: float = 0.0, noise: float = NOISE, swing: float = 0.0, walk: float = 5e-5,
-            shake: float = 0.0, band: tuple[float, float] | None = None, clock: float = 0.0
-            ) -> Stretch:
+            shake: float = 0.0, band: tuple[float, float] | None = None, clock: float = 0.0,
+            sway: float = 0.0) -> Stretch:
     """
     Return the stretch of a shaft whose speed walks at random; sizes in units of the jitter.
 
     Pulses have the declared jitter times `scale`, `excess` normal errors of correlation `rho`,
     uneven `marks`, `shocks` that fade, and `hum`; the source moves by `wander`, flat in a `band`
     or else slower; the clock has a `skew` and ticks of a rate `clock`, the path a `delay` in s.
-    The speed has steps of `walk` and a `swing`, its bends inside the cycles those of a `shake`.
+    The speed has steps of `walk`, a `swing`, and a `sway` in the `band`, its bends inside the
+    cycles those of a `shake`.
     """
     rng = np.random.default_rng([29, *np.atleast_1d(seed)])
     index = np.arange(count)
     speed = walk * lfilter([1.0], [1.0, -0.99], rng.standard_normal(count))
     slow = swing * np.sin(2.0 * np.pi * index / count)
+    if sway and band:
+        speed += sway * flat(rng, count, band)
     motion = PERIOD * np.cumsum(1.0 + speed + slow)
     errors = scale * rng.uniform(-0.5, 0.5, count) / MODEL.keyphasor_rate
     drawn = rng.standard_normal(count) * np.sqrt(1.0 - rho**2)

@@ -173,6 +173,16 @@ def test_uneven_marks_are_found_mark_by_mark():
 
 
 @pytest.mark.machines
+def test_a_speed_that_sways_up_to_a_sharp_edge_is_no_source_that_moves():
+    """As a speed control makes it; without a motion of this kind every fifth machine is wrong."""
+    for seed in range(8):
+        rng = np.random.default_rng([78, seed])
+        drawn = {'sway': 10.0 ** rng.uniform(-3.7, -2.7), 'band': (0.006, rng.uniform(0.06, 0.25)),
+                 'noise': 10.0 ** rng.uniform(-1.9, -1.0)}
+        assert names_of(read_timing([machine([77, seed], walk=0.0, **drawn)])) == set(), drawn
+
+
+@pytest.mark.machines
 def test_two_effects_are_told_apart():
     timing = read_timing([machine(3, excess=1.0, rho=0.8, skew=4e-5)])
     assert names_of(timing) == {'correlated_jitter', 'clock_skew'}

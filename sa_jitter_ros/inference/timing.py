@@ -383,10 +383,10 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     data = fit.data
     if data.series < 3:  # nothing is known of what happens inside the cycles
         return None
-    made = {name: fit.contribution(name)[:, 2, 2].real
-            for name in (SHAFT, *fit.spectra) if fit.moves(name) in (MOTION, SOURCE)}
+    shaft, source = (sum(fit.contribution(name)[:, 2, 2].real for name in (SHAFT, *fit.spectra)
+                         if fit.moves(name) == direction) for direction in (MOTION, SOURCE))
     # of each frequency by itself: the rest are bends of a source that moves
-    share = made[SHAFT] / (sum(made.values()) + fit.declared_motion[:, 2, 2].real)
+    share = shaft / (shaft + source + fit.declared_motion[:, 2, 2].real)
     kept, density = np.sqrt(share), data.size * data.noise[:, 2, 2].real
     passed = float(share @ density / density.sum())
     parts, next_, count = [], [], 0

@@ -52,6 +52,8 @@ EXCESS = 'excess_jitter'
 NO_EFFECTS = RIPPLE, SIDEBANDS, BAND, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
+# Logarithms of power and width, and of half the order, from which one of these is sought.
+_EDGES = (0.0, math.log(0.3), 1.4), (-4.0, math.log(0.1), 2.0), (-4.0, math.log(0.05), 2.0)
 _STEP = 0.01  # of the tick by which the size of a pattern is varied, to either side
 
 
@@ -122,7 +124,7 @@ class Chooser:
             self.patterns[RIPPLE] = Pattern(lambda setting: np.zeros((0, 0))), marks
         self.spectra = {name: kind.timing for name, kind in EFFECTS.items()
                         if isinstance(kind.timing, Spectrum)}
-        self.spectra[BAND] = replace(PhaseWander.timing, direction=MOTION)
+        self.spectra[BAND] = replace(PhaseWander.timing, direction=MOTION, starts=_EDGES)
         lines = np.unique(np.concatenate([item.sidebands for item in stretches]))
         if lines.size:
             self.spectra[SIDEBANDS] = Spectrum(
