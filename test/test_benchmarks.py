@@ -95,9 +95,12 @@ def test_intervals_of_corrected_amplitudes_hold_in_many_settings(benchmark):
         assert len(corrected) == trials
         shares[setting.another_shaft] += np.mean([
             np.abs(corrected) < 1.0, np.abs(corrected) < 1.96, below], axis=2).T.tolist()
+    wanted = np.array([0.683, 0.95, 0.95])
     for another_shaft, found in shares.items():
-        error = np.std(found, axis=0) / np.sqrt(len(found))
-        off = np.mean(found, axis=0) - [0.683, 0.95, 0.95]
+        # of three orders or more, which scatter by themselves at best
+        error = np.maximum(np.std(found, axis=0), np.sqrt(wanted * (1.0 - wanted) / 3.0)
+                           ) / np.sqrt(len(found))
+        off = np.mean(found, axis=0) - wanted
         assert np.all(off > -0.03 - 3.0 * error)
         if not another_shaft:
             assert np.all(off[:2] < 0.03 + 3.0 * error[:2])

@@ -284,26 +284,22 @@ def test_states_are_those_of_the_dense_model():
 
 def test_run_up_through_resonances():
     """Each line turns by itself where it passes a resonance; the errors stated grow with it."""
-    ratios, larger = [], []
-    for seed in range(101, 106, 2):
-        rng = np.random.default_rng(seed)
-        time = np.arange(int(25.0 * RATE)) / RATE
-        turns = np.cumsum(12.0 + 0.5 * time + 0.05 * np.sin(2.0 * np.pi * 0.3 * time)) / RATE
-        speed = np.gradient(turns, 1.0 / RATE)
-        plain, turned = 0.5 * rng.standard_normal((2, 2, time.size))
-        for order in ORDERS:
-            line = np.exp(2j * np.pi * order * turns)
-            for channel in range(2):
-                place, damping = rng.uniform(10.0, 28.0), rng.uniform(0.04, 0.1)
-                gain = 1.0 / (1.0 - (speed / place) ** 2 + 1j * damping * speed / place)
-                plain[channel] += line.real
-                turned[channel] += np.real(gain / np.median(np.abs(gain)) * line)
-        stated = []
-        for vibration in (plain, turned):
-            found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 31.0))
-            stated.append(np.median(found.standard_errors * found.speed))
-        off = error(found, lambda at, time=time, turns=turns: np.interp(at, time, turns))
-        ratios.append(off.std() / stated[1])
-        larger.append(stated[1] / stated[0])
-    assert np.median(larger) > 10.0
-    assert np.median(ratios) < 2.0
+    rng = np.random.default_rng(101)
+    time = np.arange(int(25.0 * RATE)) / RATE
+    turns = np.cumsum(12.0 + 0.5 * time + 0.05 * np.sin(2.0 * np.pi * 0.3 * time)) / RATE
+    speed = np.gradient(turns, 1.0 / RATE)
+    plain, turned = 0.5 * rng.standard_normal((2, 2, time.size))
+    for order in ORDERS:
+        line = np.exp(2j * np.pi * order * turns)
+        for channel in range(2):
+            place, damping = rng.uniform(10.0, 28.0), rng.uniform(0.04, 0.1)
+            gain = 1.0 / (1.0 - (speed / place) ** 2 + 1j * damping * speed / place)
+            plain[channel] += line.real
+            turned[channel] += np.real(gain / np.median(np.abs(gain)) * line)
+    stated = []
+    for vibration in (plain, turned):
+        found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 31.0))
+        stated.append(np.median(found.standard_errors * found.speed))
+    off = error(found, lambda at: np.interp(at, time, turns))
+    assert stated[1] > 10.0 * stated[0]
+    assert off.std() < 2.0 * stated[1]
