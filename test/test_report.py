@@ -61,7 +61,7 @@ def traced(marks=1, **effects):
 
 @pytest.fixture(scope='module')
 def traces():
-    """Return traces of each verdict."""
+    """Yield traces of each verdict."""
     found = {'none': traced(), 'traced': traced(excess_jitter={'std': 5e-5}),
              'geometry': traced(3, target_geometry={'pulse_angles': (0.0, 0.006, -0.004)}),
              'grid': traced(keyphasor_quantisation={'clock_rate': 4000.0, 'period_std': 2e-5})}
@@ -69,7 +69,8 @@ def traces():
                                    after=found['traced'].before,
                                    prediction_after=found['traced'].prediction_before)
     found['blind'] = replace(found['unexplained'], evidence=None)
-    return found
+    yield found
+    DRAWN.clear()
 
 
 @pytest.fixture(scope='module')
