@@ -42,6 +42,15 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_teardown(item, nextitem):
+    """Let it leave alone what the tests of a file have left, too."""
+    yield
+    if nextitem is not None and nextitem.path != item.path:
+        gc.collect()
+        gc.freeze()
+
+
 @pytest.fixture
 def rng():
     """Return the random generator of one test, the same in every run."""

@@ -82,37 +82,35 @@ def test_a_corrected_amplitude_is_no_worse_and_not_biased(benchmark, values):
 @pytest.mark.machines
 def test_intervals_of_corrected_amplitudes_hold_in_many_settings(benchmark):
     """
-    Over all settings together to 3 points, each within the error of very few averages.
+    Over all settings together to 3 points, beside what few averages scatter.
 
     Lines of another shaft that a few cycles do not tell make intervals too safe;
     `test_averaging_other_lines.py` has more of these.
     """
-    campaign, trials = benchmark('interval_coverage'), 6
-    inside = np.zeros((2, 0))
+    campaign, trials, shares = benchmark('interval_coverage'), 3, {False: [], True: []}
     for number, setting in enumerate(campaign.SETTINGS):
         if setting.another_shaft and setting.ratio != 1.0:
             continue
         corrected, _, below = campaign.setting_distances(setting, trials, seed=5000 + number)
-        assert len(corrected) > 0.9 * trials
-        for width, wanted in ((1.0, 0.683), (1.96, 0.95)):
-            share = np.mean(np.abs(corrected) < width)
-            assert share > wanted - 0.03 - 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
-            if not setting.another_shaft:
-                assert share < wanted + 0.03 + 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
-        assert below.mean() > 0.92 - 3.0 * np.sqrt(0.05 * 0.95 / trials)
-        if not setting.another_shaft:
-            inside = np.concatenate((inside, [
-                np.abs(corrected).ravel() < width for width in (1.0, 1.96)]), axis=1)
-    wanted = np.array([0.683, 0.95])
-    error = np.sqrt(wanted * (1.0 - wanted) / trials / (len(campaign.SETTINGS) - 9))
-    assert np.all(np.abs(inside.mean(axis=1) - wanted) < 0.03 + 3.0 * error)
+        assert len(corrected) == trials
+        shares[setting.another_shaft] += np.mean([
+            np.abs(corrected) < 1.0, np.abs(corrected) < 1.96, below], axis=2).T.tolist()
+    wanted = np.array([0.683, 0.95, 0.95])
+    for another_shaft, found in shares.items():
+        # of three orders or more, which scatter by themselves at best
+        error = np.maximum(np.std(found, axis=0), np.sqrt(wanted * (1.0 - wanted) / 3.0)
+                           ) / np.sqrt(len(found))
+        off = np.mean(found, axis=0) - wanted
+        assert np.all(off > -0.03 - 3.0 * error)
+        if not another_shaft:
+            assert np.all(off[:2] < 0.03 + 3.0 * error[:2])
 
 
 @pytest.mark.campaign
 def test_recordings_with_different_keyphasors_share_one_scale(benchmark, tmp_path):
     scale = benchmark('fleet_scale')
-    found = scale.fleet(3, 4, tmp_path)
-    assert {item.raw.size for item in found.values()} == {4}
+    found = scale.fleet(3, 2, tmp_path)
+    assert {item.raw.size for item in found.values()} == {2}
     for (width, order), item in found.items():
         known = np.isfinite(item.corrected)
         assert known.all() or width == scale.WIDTHS[-1]
@@ -122,7 +120,7 @@ def test_recordings_with_different_keyphasors_share_one_scale(benchmark, tmp_pat
         assert np.all(item.error[known] < 0.05 * item.true[known])
         if width > 0.1:
             assert np.all(item.raw < item.true - 4.0 * item.error[known].max()), order
-    assert '| 46 | 0.4 mesh periods | 4 |' in scale.fleet_table(found)
+    assert '| 46 | 0.4 mesh periods | 2 |' in scale.fleet_table(found)
     assert len(scale.fleet_figure(found).axes) == 4
 
 
@@ -130,8 +128,10 @@ def test_recordings_with_different_keyphasors_share_one_scale(benchmark, tmp_pat
 def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, tmp_path):
     scale = benchmark('fleet_scale')
     whole, path = read(shared_data / 'gear0_gearbox.npz'), tmp_path / 'gear0.npz'
-    write_npz(path, replace(whole, vibration=ArraySource(whole.read()[:2]), channel_names=(),
-                            units=()))
+    pulses = whole.reference_pulse_times[:130]
+    write_npz(path, replace(
+        whole, vibration=ArraySource(whole.read()[:2, :int(whole.sample_rate * pulses[-1])]),
+        reference_pulse_times=pulses, channel_names=(), units=()))
     found = scale.gearbox(path, (3300.0, 9100.0), tmp_path)
     for item in found.values():
         assert np.all(np.abs(item.corrected - item.true) < 4.0 * item.error)
@@ -183,7 +183,7 @@ def test_methods_are_timed_in_turns(benchmark):
 
 @pytest.mark.campaign
 def test_memory_does_not_grow_with_the_record(benchmark):
-    _, short, _, long = benchmark('core_speed').memory(0.4).values()  # 4 and 16 s
+    _, short, _, long = benchmark('core_speed').memory(0.2).values()  # 2 and 8 s
     assert long < 1.05 * short
 
 
@@ -197,16 +197,20 @@ def run(script, *arguments, environment):
 
 
 @pytest.mark.campaign
-def test_page_is_written_from_small_runs(benchmark, process_environment, tmp_path):
-    page, performance = benchmark('page'), benchmark('performance')
-    small = '--scale', '0.03', '--rounds', '1'
+def test_page_is_written_from_small_runs(
+        benchmark, process_environment, tmp_path, monkeypatch, capsys):
+    page, performance, found = benchmark('page'), benchmark('performance'), {}
+    monkeypatch.setenv('OMP_NUM_THREADS', '1')
+    monkeypatch.setattr(os, 'cpu_count', lambda: 1)
+    monkeypatch.setattr(benchmark('loop_speed'), 'LOOPS', [(0.0, 10000.0, (1.0,), 1)])
     with ThreadPoolExecutor() as pool:  # the graph waits for its processes most of the time
         graph = pool.submit(run, 'graph_speed.py', '--channels', '2', '--large', '2', '--seconds',
                             '4', '--latency-seconds', '0', environment=process_environment)
-        found = {
-            'core': run('core_speed.py', *small, environment=process_environment),
-            'loop': run('loop_speed.py', *small, '--loops', '1', environment=process_environment),
-            'graph': graph.result()}
+        for name in ('core', 'loop'):
+            monkeypatch.setattr(sys, 'argv', [name, '--scale', '0.03', '--rounds', '1'])
+            assert benchmark(f'{name}_speed').main() == 0
+            found[name] = json.loads(capsys.readouterr().out)
+        found['graph'] = graph.result()
     graph, large = found['graph']['runs']
     assert graph['averages'] > 10
     assert large['peak_megabytes'] > graph['peak_megabytes'] + 32.0  # of shared memory
@@ -301,11 +305,11 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
 
 @pytest.mark.campaign
 def test_fault_replay_finds_no_wrong_average(benchmark, capsys):
-    assert benchmark('fault_replay').main(['--scenes', '10', '--seed', '70000']) == 0
+    assert benchmark('fault_replay').main(['--scenes', '5', '--seed', '70001']) == 0
     for line in capsys.readouterr().out.splitlines():
         scenes, averages, wrong = re.findall(r'\d+', line)
-        assert (int(scenes), int(wrong)) == (10, 0)
-        assert int(averages) > 25
+        assert (int(scenes), int(wrong)) == (5, 0)
+        assert int(averages) > 12
 
 
 def test_soak_says_which_averages_a_full_queue_lost(benchmark):
@@ -350,20 +354,22 @@ def test_soak_follows_memory_and_writes_its_page(process_environment, tmp_path):
 @pytest.mark.campaign
 def test_months_of_averages_are_simulated(benchmark):
     monitor = benchmark('change_monitor')
-    found, years = monitor.false_alarms(monitor.CASES[0], 24, 0.25, seed=1)
+    found, years = monitor.false_alarms(monitor.CASES[0], 24, 1.0 / 12.0, seed=1)
     assert years == pytest.approx(2.0, rel=0.01)
     assert found <= years + 4.0 * np.sqrt(years)
-    faults = [*monitor.detections(30, seed=2, months=5)]
+    faults = [*monitor.detections(30, seed=2, months=3)]
     assert len(faults) >= 15  # others had an alarm before, one a year, or began later
     quick = [days for kind, growth, days, known in faults
-             if kind == 'order, noise 1 %' and growth > 0.1]
+             if kind == 'order, noise 1 %' and growth > 0.1 and known]
+    assert quick
     assert all(days < 5.0 for days in quick)
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_a_damaged_recording_ends_in_one_line_or_with_a_report(benchmark, capsys):
-    assert benchmark('damaged_recordings').main(['--first', '10', '--count', '6']) == 0
-    assert capsys.readouterr().out.startswith('status 0: 1, status 2: 5; ')
+    assert benchmark('damaged_recordings').main(['--first', '17', '--count', '3']) == 0
+    assert capsys.readouterr().out.startswith('status 0: 1, status 2: 2; ')
 
 
 @pytest.mark.machines

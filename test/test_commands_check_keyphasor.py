@@ -94,6 +94,7 @@ def test_machine_file_starts_every_node(name, written, recording, ros_graph):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_machine_file_declares_the_machine_to_the_commands(written, recording, capsys):
     machine = written / 'machine.yaml'
     declaration = read_declaration(machine)

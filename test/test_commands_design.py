@@ -123,6 +123,7 @@ def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('orders', [['0.001'], ['38', '100']])
 def test_figure_of_orders_without_iso_lines_and_of_pulses_that_could_swap(
         tmp_path, capsys, orders):

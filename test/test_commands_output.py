@@ -29,10 +29,10 @@ from sa_jitter_ros.parameter_file import shipped
 
 @pytest.mark.processes
 @pytest.mark.parametrize(('output', 'status', 'says'), [
-    ('/dev/full', 2, 'design: standard output: No space left on device\n'), ('head', 0, '')])
+    ('/dev/full', 2, 'layouts: standard output: No space left on device\n'), ('head', 0, '')])
 def test_output_that_cannot_be_printed_is_one_line(tmp_path, output, status, says):
-    command = [sys.executable, '-m', 'sa_jitter_ros.commands.design', '--orders', '0.1',
-               '--trigger-speed', '20', '--output', str(tmp_path / 'a.png')]
+    command = [sys.executable, '-m', 'sa_jitter_ros.commands.layouts', '--params',
+               str(shipped('machine.yaml')), '--output', str(tmp_path)]
     target = subprocess.PIPE if output == 'head' else Path(output).open('w')
     process = subprocess.Popen(command, stdout=target, stderr=subprocess.PIPE, text=True)
     (process.stdout or target).close()  # head has seen enough

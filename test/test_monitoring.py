@@ -56,7 +56,7 @@ def test_evidence_reaches_its_threshold_once_in_the_stated_number_of_scores():
     units, quantities, scores = 400, 4, 400.0
     evidence, times, started = ChangeEvidence((units, quantities)), [], np.zeros(units)
     mix = np.array([0.0, 0.5, 0.9, 0.99])  # quantities that scatter together with the first
-    for now in range(1, 6001):
+    for now in range(1, 3001):
         own = rng.standard_normal((units, quantities))
         evidence.update(mix * own[:, :1] + np.sqrt(1.0 - mix**2) * own)
         again = evidence.changed(threshold(scores)).any(axis=1)
@@ -94,10 +94,10 @@ LAWS = {
 @pytest.mark.machines
 @pytest.mark.parametrize('law', LAWS)
 def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
-    shape = (80, 8)
+    shape, length = (80, 8), 2000 if law == 'unsteady' else 1000  # it takes longer to learn
     found, expected = alarms_of(
         LAWS[law](np.random.default_rng(7), shape), units=shape[0], quantities=shape[1],
-        learning=40, scores=1000.0, length=2000)
+        learning=40, scores=0.5 * length, length=length)
     assert found <= expected + 3.0 * np.sqrt(expected)
     # each machine loses the time that its first alarm takes to build up: a third of its alarms
     assert found >= 0.5 * expected - 3.0 * np.sqrt(expected)
@@ -109,14 +109,14 @@ def test_slow_unsteadiness_below_the_noise_is_learnt():
     shape, scores = (80, 8), 2000.0
     draw = smooth(np.random.default_rng(8), shape, 0.95, 2.0)
     test, unknown, alarms = ChangeTest(shape, learning=40), np.full(shape, np.nan), []
-    for number in range(4500):
+    for number in range(3000):
         changed, _ = test.update(0, draw(), unknown, unknown, (number, number), scores)
         again = changed.any(axis=1)
         alarms.append(int(again.sum()))
         test.active[again] = False
         test.evidence.ratios[:, again] = test.evidence.sums[:, again] = 0.0
-    late = sum(alarms[3000:])
-    expected = shape[0] * 1500 / scores
+    late = sum(alarms[2000:])
+    expected = shape[0] * 1000 / scores
     # scatter over 256 groups is known to a quarter: twice the rate
     assert late <= 2.0 * expected + 3.0 * np.sqrt(2.0 * expected)
 
@@ -267,16 +267,16 @@ def test_indicators_change_too_and_fall():
 def test_standard_errors_of_changes_hold():
     """Without selection: the estimate of what came since a change that is far above threshold."""
     z = []
-    for seed in range(40):
+    for seed in range(10):
         machine = Machine(100 + seed)
         monitor = machine.monitor(learning_averages=100)
         machine.run(monitor, 100)
         machine.gain[:] = 1.2
         machine.run(monitor, 100)
         found = {(item.channel, item.name): item for item in monitor.changes()}
-        item = found[0, '38']
-        z.append((item.change - 0.2) / item.standard_error)
-    # the load is common to a unit's orders: each machine counts once
+        z += [(item.change - 0.2) / item.standard_error for item in (
+            found[channel, name] for channel in (0, 1) for name in ('19', '38'))]
+    # the load, which they have in common, is below 4 % of their variance
     assert abs(np.mean(z)) < 4.0 / np.sqrt(len(z))
     assert np.std(z) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * len(z)))
 
@@ -698,7 +698,7 @@ def test_full_disk_and_unwritable_folder_keep_the_older_file(kept, monkeypatch):
 # --- with true averages --------------------------------------------------------------------------
 
 
-def averages_of(rate, *, seed, seconds=50.0, damaged=False):
+def averages_of(rate, *, seed, seconds=27.0, damaged=False):
     """Return the arrays of averages of a simulated gear whose keyphasor is sampled at a rate."""
     harmonics = [1.0, 0.55 if damaged else 0.5, 0.25]
     gear = Gearbox(
@@ -715,7 +715,7 @@ def averages_of(rate, *, seed, seconds=50.0, damaged=False):
 
 @pytest.mark.machines
 def test_exchanged_keyphasor_of_a_simulated_gear_is_no_change_and_damage_is():
-    monitor = MachineMonitor('gear', ['input'], Settings(learning_averages=48, group_averages=4))
+    monitor = MachineMonitor('gear', ['input'], Settings(learning_averages=32, group_averages=4))
 
     def watch(**options):
         return [line for arrays in averages_of(**options) for kind in KINDS if kind in arrays

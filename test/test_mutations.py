@@ -34,7 +34,7 @@ def test_what_noticed_is_published_and_open_or_a_test():
 
 @pytest.mark.machines
 def test_without_a_move_nothing_changes():
-    assert not differs(['damaged louder 0'])
+    assert not differs(['damaged faster 0'])
 
 
 @pytest.mark.machines

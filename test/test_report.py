@@ -52,7 +52,7 @@ def traced(marks=1, **effects):
         fluctuation=band_limited(std=2e-4, band=(0.1, 2.0), seed=1, name='speed'),
         effects=(DeclaredJitter('uniform', 1.0 / (CLOCK * np.sqrt(12.0))), AdditiveNoise(0.05),
                  *make_effects(effects)))
-    seconds = 9.0
+    seconds = 6.0
     recording = Recording(
         ArraySource(machine.vibration(0, int(seconds * RATE))), RATE, ratio=model.ratio,
         pulse_times=machine.pulses(0.0, seconds).times, channel_names=('<left>', 'right & top'))
@@ -61,7 +61,7 @@ def traced(marks=1, **effects):
 
 @pytest.fixture(scope='module')
 def traces():
-    """Return traces of each verdict."""
+    """Yield traces of each verdict."""
     found = {'none': traced(), 'traced': traced(excess_jitter={'std': 5e-5}),
              'geometry': traced(3, target_geometry={'pulse_angles': (0.0, 0.006, -0.004)}),
              'grid': traced(keyphasor_quantisation={'clock_rate': 4000.0, 'period_std': 2e-5})}
@@ -69,7 +69,8 @@ def traces():
                                    after=found['traced'].before,
                                    prediction_after=found['traced'].prediction_before)
     found['blind'] = replace(found['unexplained'], evidence=None)
-    return found
+    yield found
+    DRAWN.clear()
 
 
 @pytest.fixture(scope='module')
@@ -77,7 +78,7 @@ def files(traces):
     """Return the files of some reports."""
     return {verdict: report_files(
         traces[verdict], report(traces[verdict], recordings=['a<b>.npz']))
-            for verdict in ('none', 'traced', 'blind')}
+            for verdict in ('traced', 'blind')}
 
 
 class Page(HTMLParser):
@@ -102,7 +103,7 @@ class Page(HTMLParser):
         self.text += data.replace('\u00a0', ' ')  # numbers that stay with their units
 
 
-@pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
+@pytest.mark.parametrize('verdict', ['traced', 'blind'])
 def test_page_is_complete_and_self_contained(files, verdict):
     found = files[verdict]
     names = NAMES if verdict != 'blind' else {'residual', 'distribution'}
@@ -220,7 +221,7 @@ def test_nothing_is_pasted_where_nothing_was_found(traces):
     assert report(traces['none'])['parameter_file'] == ''
 
 
-@pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
+@pytest.mark.parametrize('verdict', ['traced', 'blind'])
 def test_nothing_runs_over_the_edge_of_a_picture(files, verdict):
     for name, data in files[verdict].items():
         if name.endswith('.png'):
@@ -236,9 +237,9 @@ def test_many_effects_leave_room_in_the_panels(traces):
     assert 'with 3 effects' in axes.get_legend_handles_labels()[1]
 
 
-@pytest.mark.parametrize('verdict', ['none', 'traced', 'geometry', 'grid', 'unexplained'])
+@pytest.mark.parametrize('verdict', ['none', 'traced', 'geometry', 'grid'])
 def test_panels_are_labelled(traces, verdict):
-    figures = illustrate(traces[verdict])
+    figures = drawn(traces[verdict])
     assert {item.name for item in figures} == NAMES
     for item in figures:
         arrange(item.figure)
@@ -310,9 +311,21 @@ def curve(axes, label):
     return np.array(line.get_data(), dtype=float)
 
 
+DRAWN = []  # traces with their figures
+
+
+def drawn(trace):
+    """Return the figures of a trace, which are made once."""
+    for known, figures in DRAWN:
+        if known is trace:
+            return figures
+    DRAWN.append((trace, illustrate(trace)))
+    return DRAWN[-1][1]
+
+
 def panel(trace, name, title):
     """Return the axes with a title, or part of one, of one figure."""
-    (figure,) = [item.figure for item in illustrate(trace) if item.name == name]
+    (figure,) = [item.figure for item in drawn(trace) if item.name == name]
     (axes,) = [item for item in figure.axes if title in item.get_title()]
     return axes
 
@@ -330,8 +343,9 @@ def test_recovered_errors_follow_the_traced_effect(traces):
     label = 'with excess_jitter'
     axes = panel(trace, 'trigger_cycle', 'over the trigger cycle')
     with_effect, recovered = curve(axes, label)[1], curve(axes, 'recovered')[1]
-    # 9 acquisitions of 21 pulses: the RMS of n normal errors is known to 1/sqrt(2n)
-    np.testing.assert_allclose(recovered, with_effect, rtol=4.0 / np.sqrt(2.0 * 9 * 21))
+    # the RMS of n normal errors is known to 1/sqrt(2n)
+    np.testing.assert_allclose(
+        recovered, with_effect, rtol=4.0 / np.sqrt(2.0 * trace.evidence.errors.size))
     assert (recovered > 2.0 * curve(axes, 'declared model')[1]).all()
 
 
@@ -357,7 +371,7 @@ def test_target_is_folded_by_its_period(traces):
     # the marks' place in the record is arbitrary: the first trigger pulse need not be mark 0
     gaps = [np.abs(known - known.mean() - np.roll(truth - truth.mean(), k)).max()
             for k in range(3)]
-    assert min(gaps) < 5e6 / (CLOCK * np.sqrt(12.0)) / np.sqrt(9 * 21 / period)
+    assert min(gaps) < 5e6 / (CLOCK * np.sqrt(12.0)) / np.sqrt(trace.evidence.errors.size / period)
 
 
 def test_lattice_panel_names_the_clock_of_the_pulse_times(traces):

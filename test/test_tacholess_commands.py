@@ -79,6 +79,7 @@ def test_lost_tach_is_bridged(folder, capsys):
     assert '20 pulses that the tach lost were found in the vibration' in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_check_and_loop_without_a_tach(folder, capsys):
     assert check_keyphasor.main([str(folder / 'rig.npz'), *TACHOLESS, '--output',
                                  str(folder / 'found'), '--quiet']) == 0
@@ -131,6 +132,7 @@ def test_orders_of_the_machine_file_and_a_second_run(folder, capsys):
     assert 'pulses from orders 19, 38, at ' in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_loop_of_a_folder_without_a_tach(folder):
     several = folder / 'several'
     several.mkdir()

@@ -93,10 +93,11 @@ def test_covariance_agrees_with_standard_errors_and_parts(run_up):
 
 
 def test_used_orders_are_too_large_and_others_too_small():
-    """Means over averages of many machines, against what is expected of each."""
-    off = {True: [], False: []}
-    for seed in range(10):
+    """By as much as is expected: both are of the same averages, whose noise does not count."""
+    rows = []
+    for seed in range(4):
         vibration, _ = made(seed, noise=2.0, seconds=10.0)
+        row = []
         for used in (True, False):
             found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=RANGE,
                                    hold_out=() if used else ORDERS[1:2])
@@ -105,12 +106,15 @@ def test_used_orders_are_too_large_and_others_too_small():
             average = sa.average(vibration, RATE, found.times, orders=ORDERS, trigger_cycles=60,
                                  angle_law='spline')
             measured = np.mean([np.abs(item.amplitudes[0, 1]) for item in average])
-            off[used].append((measured, expected.factor[1]))
-    for used, rows in off.items():
-        measured, factor = np.array(rows).T
-        assert np.all((factor > 1.0) == used)
-        difference = measured - factor
-        assert abs(difference.mean()) < 3.0 * difference.std() / np.sqrt(len(rows))
+            row.append((measured, expected.factor[1]))
+        rows.append(row)
+    measured, factor = np.moveaxis(rows, 2, 0)
+    assert np.all((factor > 1.0) == [True, False])
+    # over 20 machines the standard deviations are 0.018 of an average, 0.0015 of a difference
+    assert np.all(np.abs((measured - factor).mean(axis=0)) < 3.0 * 0.018 / np.sqrt(len(rows)))
+    difference = np.diff(measured - factor)
+    assert abs(difference.mean()) < 3.0 * 0.0015 / np.sqrt(len(rows)) < 0.5 * np.mean(
+        factor[:, 0] - factor[:, 1])
 
 
 def test_correction_covers_the_truth(run_up):
@@ -280,26 +284,22 @@ def test_states_are_those_of_the_dense_model():
 
 def test_run_up_through_resonances():
     """Each line turns by itself where it passes a resonance; the errors stated grow with it."""
-    ratios, larger = [], []
-    for seed in range(101, 106, 2):
-        rng = np.random.default_rng(seed)
-        time = np.arange(int(25.0 * RATE)) / RATE
-        turns = np.cumsum(12.0 + 0.5 * time + 0.05 * np.sin(2.0 * np.pi * 0.3 * time)) / RATE
-        speed = np.gradient(turns, 1.0 / RATE)
-        plain, turned = 0.5 * rng.standard_normal((2, 2, time.size))
-        for order in ORDERS:
-            line = np.exp(2j * np.pi * order * turns)
-            for channel in range(2):
-                place, damping = rng.uniform(10.0, 28.0), rng.uniform(0.04, 0.1)
-                gain = 1.0 / (1.0 - (speed / place) ** 2 + 1j * damping * speed / place)
-                plain[channel] += line.real
-                turned[channel] += np.real(gain / np.median(np.abs(gain)) * line)
-        stated = []
-        for vibration in (plain, turned):
-            found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 31.0))
-            stated.append(np.median(found.standard_errors * found.speed))
-        off = error(found, lambda at, time=time, turns=turns: np.interp(at, time, turns))
-        ratios.append(off.std() / stated[1])
-        larger.append(stated[1] / stated[0])
-    assert np.median(larger) > 10.0
-    assert np.median(ratios) < 2.0
+    rng = np.random.default_rng(101)
+    time = np.arange(int(25.0 * RATE)) / RATE
+    turns = np.cumsum(12.0 + 0.5 * time + 0.05 * np.sin(2.0 * np.pi * 0.3 * time)) / RATE
+    speed = np.gradient(turns, 1.0 / RATE)
+    plain, turned = 0.5 * rng.standard_normal((2, 2, time.size))
+    for order in ORDERS:
+        line = np.exp(2j * np.pi * order * turns)
+        for channel in range(2):
+            place, damping = rng.uniform(10.0, 28.0), rng.uniform(0.04, 0.1)
+            gain = 1.0 / (1.0 - (speed / place) ** 2 + 1j * damping * speed / place)
+            plain[channel] += line.real
+            turned[channel] += np.real(gain / np.median(np.abs(gain)) * line)
+    stated = []
+    for vibration in (plain, turned):
+        found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=(9.0, 31.0))
+        stated.append(np.median(found.standard_errors * found.speed))
+    off = error(found, lambda at: np.interp(at, time, turns))
+    assert stated[1] > 10.0 * stated[0]
+    assert off.std() < 2.0 * stated[1]
