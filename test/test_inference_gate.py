@@ -119,7 +119,8 @@ def test_trace_with_effects_that_harm_can_not_be_made():
     {'amplitude_modulation': {'std': 0.2}}, {'phase_wander': {'std': 0.05}},
     {'speed_fluctuation': {'acceleration_std': 60.0}}]), st.booleans())
 def test_loop_makes_no_random_machine_worse(seed, effects, on_ticks):
-    vibration, pulses = machine(*make_effects(effects), seed=seed, jitter=not on_ticks)
+    vibration, pulses = machine(*make_effects(effects), seed=seed, seconds=7.0,
+                                jitter=not on_ticks)
     if on_ticks:
         pulses = np.ceil(pulses * 5000.0) / 5000.0
     content = closed(vibration, pulses)

@@ -120,7 +120,7 @@ def test_what_is_found_is_averaged_without_loss(rng):
 @pytest.fixture
 def files(rng, tmp_path):
     """Return the paths of a recording of a wheel with an extra mark, and of its machine file."""
-    pulses = pulses_on(rng, with_extra(12, 0.34), turns=300, ramp=0.0, jitter=2e-5)
+    pulses = pulses_on(rng, with_extra(12, 0.34), turns=120, ramp=0.0, jitter=2e-5)
     turns = SPEED * np.arange(round(3000.0 * (pulses[-1] + 0.1))) / 3000.0
     samples = np.cos(2.0 * np.pi * turns) + np.cos(48.0 * np.pi * turns)
     recording = Recording(ArraySource((samples + 0.1 * rng.normal(size=turns.size))[None]), 3000.0,
