@@ -339,9 +339,7 @@ def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, param
 @pytest.mark.machines
 @pytest.mark.parametrize(('name', 'declared', 'size'), [
     ('additive_noise', {'std': 1.0}, 'std'),
-    ('amplitude_modulation', {'std': 0.05}, 'std'),
     ('missing_pulses', {'probability': 0.03}, 'probability'),
-    ('excess_jitter', {'std': 3e-4}, 'std'),
     ('clock_skew', {'skew': 4e-4}, 'skew'),
     ('phase_wander', {'std': 0.01}, 'std'),
 ])
