@@ -318,7 +318,6 @@ def test_declared_effect_is_not_missing():
 @pytest.mark.machines
 @pytest.mark.parametrize(('name', 'true', 'parameter', 'wrong'), [
     ('additive_noise', {'std': 1.0}, 'std', 0.5),
-    ('amplitude_modulation', {'std': 0.3}, 'std', 0.1),
     ('interfering_tone', {'frequency': 400.9, 'amplitude': 0.12}, 'amplitude', 0.06),
 ])
 def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, parameter, wrong):
