@@ -111,7 +111,8 @@ def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds()
     times, true = np.arange(round(44 / SPEED * rate)) / rate, (2.0 + np.arange(41)) / SPEED
     wave = np.exp(2j * np.pi * SPEED * np.outer(orders, times - true[0]))
     u, z, raised = (np.arange(8) + 0.5) / 8.0, [], []
-    for _ in range(80):
+    trials = 40
+    for _ in range(trials):
         phase = np.exp(2j * np.pi * rng.uniform(size=3))
         samples = ((size * phase) @ wave).real + 2.0 * rng.standard_normal(times.size)
         errors = rng.uniform(-0.5, 0.5, 41) / 1100.0
@@ -125,16 +126,16 @@ def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds()
                  / correction.attenuation_standard_error[0])
         raised.append(np.abs([correction.amplitudes[0], average.amplitudes[0]]) ** 2)
     inside = np.mean(np.abs(z) < 1.96, axis=0)
-    assert np.all(inside > 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 80))
+    assert np.all(inside > 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / trials))
     # noise is not aligned to itself
     corrected, raw = np.array(raised)[:, :, 1].T
     change = corrected - raw
-    assert change.mean() < 0.02 * raw.mean() + 3.0 * change.std() / np.sqrt(80.0)
+    assert change.mean() < 0.02 * raw.mean() + 3.0 * change.std() / np.sqrt(trials)
 
 
 @pytest.mark.machines
 def test_attenuation_of_five_cycles_has_a_standard_error_that_holds():
-    orders, size, cycles, trials = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3]), 5, 120
+    orders, size, cycles, trials = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3]), 5, 60
     rng, rate, std = np.random.default_rng(8), 160.0 * SPEED, 0.3 / (2.0 * np.pi * 16.0 * SPEED)
     times, true = np.arange(1920) / rate, (2.0 + np.arange(9)) / SPEED
     wave = np.exp(2j * np.pi * SPEED * np.outer(orders, times - true[0]))
@@ -223,7 +224,7 @@ def test_errors_that_follow_another_shafts_order_are_refused(rng, amplitude):
     settings = AverageSettings(trigger_cycles=6, orders=(1.0, 5.0, 30.0), correct_jitter=True,
                                keyphasor_rate=rate)
     refused = wrong = 0
-    for displaced in np.linspace(-1.2e-3, 1.2e-3, 31):
+    for displaced in np.linspace(-1.2e-3, 1.2e-3, 16):
         speed = rng.uniform(22.0, 28.0)
         true = 0.01 + np.arange(8) / speed
         pulses = true + rng.uniform(-0.5, 0.5, 8) / rate
@@ -256,38 +257,12 @@ def test_correction_needs_blocks_of_cycles():
 
 
 @pytest.mark.machines
-def test_measured_gearbox_with_a_slow_keyphasor(shared_data):
-    recording = np.load(shared_data / 'gear0_gearbox.npz')
-    samples = recording['vibration'].astype(float)
-    rate, reference = float(recording['sample_rate']), recording['reference_pulse_times']
-    orders = (23.0, 46.0, 92.0, 115.0)
-
-    def amplitudes(pulses, clock):
-        settings = AverageSettings(trigger_cycles=CYCLES, orders=orders,
-                                   correct_jitter=clock > 0.0, keyphasor_rate=clock)
-        averager = StreamingAverager({'shaft': settings}, validator=PulseValidator(),
-                                     timeline=VibrationTimeline(buffer_seconds=20.0))
-        averager.add_pulses(pulses)
-        found = averager.add_samples(SampleBlock(samples, 0.0, rate, 0))
-        return np.abs([(average.correction if clock else average).amplitudes
-                       for _, average in found])
-
-    truth = amplitudes(reference, 0.0)
-    strongest = np.argmax(truth.mean(axis=0), axis=0)
-    for clock in (2560.0, 8000.0):
-        ratio = (amplitudes(np.ceil(reference * clock) / clock, clock) / truth)[
-            :, strongest, np.arange(len(orders))]
-        np.testing.assert_allclose(ratio[:, :3], 1.0, atol=0.01)
-        np.testing.assert_allclose(ratio[:, 3], 1.0, atol=0.015)
-
-
-@pytest.mark.machines
 def test_an_order_that_the_correction_makes_smaller_is_corrected_too(rng):
     """Errors may turn a leaking order so that it reads too large."""
     corrected, raw, true = [], [], []
     times = np.arange(round(0.95 * RATE)) / RATE
     pulses = 0.05 + np.arange(16) / SPEED
-    for _ in range(20):
+    for _ in range(10):
         phase = rng.uniform(0.0, 2.0 * np.pi, 2)
         samples = sum(a * np.cos(2.0 * np.pi * g * SPEED * (times - 0.05) + at)
                       for g, a, at in zip((5.0, 6.0), (1.0, 0.05), phase))

@@ -86,10 +86,9 @@ def test_added_jitter_attenuates_as_predicted_for_the_law(law):
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('law', LAWS)
-def test_slower_clock_of_two_recordings_is_predicted_pulse_by_pulse(law):
+def test_slower_clock_of_two_recordings_is_predicted_pulse_by_pulse():
     clock = 1010.0  # 40.4 ticks a cycle: neighbouring errors are far from independent
-    model = replace(MODEL, jitter_distribution='uniform', keyphasor_rate=clock, angle_law=law,
+    model = replace(MODEL, jitter_distribution='uniform', keyphasor_rate=clock, angle_law='spline',
                     trigger_cycles=2 * CYCLES)
     recordings = [with_slower_clock(wandering(acquisitions=6, seed=seed), clock)
                   for seed in (5, 6)]
@@ -138,8 +137,10 @@ def test_gaps_cannot_be_identified_with_a_curved_angle_law():
 @pytest.mark.machines
 def test_measured_gearbox_under_added_jitter(shared_data):
     """With the law that reads most pulses for each cycle."""
+    whole = read(shared_data / 'gear0_gearbox.npz')
     recording = with_added_jitter(
-        read(shared_data / 'gear0_gearbox.npz'), Normal(6e-5), seed=4)
+        replace(whole, vibration=ArraySource(whole.read()[:2]), channel_names=(), units=()),
+        Normal(6e-5), seed=4)
     model = DeclaredModel(keyphasor_rate=1e4, trigger_speed=33.33, trigger_cycles=40,
                           orders=(23.0, 46.0, 115.0), jitter_distribution='normal',
                           jitter_std=6e-5, angle_law='spline')

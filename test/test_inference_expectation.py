@@ -92,8 +92,7 @@ def expected(model, effects, pulses):
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
-@pytest.mark.parametrize('cycles', [5, 40])
+@pytest.mark.parametrize(('cycles', 'law'), [(40, 'linear'), (5, 'spline')])
 @pytest.mark.parametrize('name', EFFECTS)
 def test_loop_scores_with_the_published_distribution(name, cycles, law):
     model = replace(MODEL, trigger_cycles=cycles, angle_law=law)
@@ -121,7 +120,7 @@ def test_known_pulses_give_the_distribution_of_their_own_average(cycles, bias, o
     """It is curved, which few cycles are `off` from; under slow errors it is of 256 draws."""
     model = replace(MODEL, trigger_cycles=cycles)
     geometry = make_effect('target_geometry', pulse_angles=[0.0, 0.02, -0.01])
-    effects, draws = [geometry], 20_000
+    effects, draws = [geometry], 8000
     errors = model.distribution.draw(rng, (draws, cycles + 1))
     if wander:  # so slow that it shifts all pulses alike, which no amplitude shows
         effects.append(make_effect('correlated_jitter', std=2e-4, correlation=0.99))

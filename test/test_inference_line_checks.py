@@ -51,7 +51,7 @@ def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn
 
 def turning_order(rng, share):
     """Check a highest order that turns by 0.5 rad, the others by a `share` of what turns it."""
-    time = np.arange(int((ACQUISITIONS * CYCLES + 4) / SPEED * RATE)) / RATE
+    time = np.arange(int((50 * CYCLES + 4) / SPEED * RATE)) / RATE
     waves = np.fft.rfft(rng.standard_normal(time.size))
     turn = np.fft.irfft(np.where(
         np.arange(waves.size) < 0.15 * SPEED * time[-1], waves, 0.0), time.size)
@@ -69,7 +69,7 @@ def turning_order(rng, share):
     return check_lines(observation, choose_lines(observation), np.zeros(3))[1]
 
 
-@pytest.mark.parametrize('share', [0.0, 0.2, 1.0])
+@pytest.mark.parametrize('share', [0.2, 1.0])
 def test_order_that_turns_by_itself_from_cycle_to_cycle_is_no_common_motion(rng, share):
     """On some machines pulse errors take its turn for theirs, and sidebands make up for it."""
     found = [turning_order(child, share) for child in rng.spawn(6)]

@@ -117,14 +117,14 @@ def test_what_turns_the_lines_as_the_speed_changes_is_found(rng, name, parameter
 
 @pytest.mark.machines
 def test_run_up_as_declared_is_as_declared(rng):
-    recording, _ = run_up(rng)
+    recording, _ = run_up(rng, stretch=0.6)
     assert traced(recording)['verdict'] == 'none'
 
 
 @pytest.mark.machines
 def test_marks_of_a_target_are_late_by_angles_at_every_speed(rng):
     angles = np.array([3e-3, -1e-3, 0.0, -2e-3])
-    recording, _ = run_up(rng, marks=4, angles=angles)
+    recording, _ = run_up(rng, marks=4, angles=angles, stretch=0.5)
     content = traced(recording, 4)
     assert content['verdict'] == 'traced'
     effect, = content['missing_effects']

@@ -62,7 +62,7 @@ CASES = {
 def test_effect_is_found_with_its_size(name):
     sizes, (parameter, truth) = CASES[name]
     off = []
-    for seed in range(3):
+    for seed in range(2):
         timing = read_timing([machine(seed, **sizes)])
         assert names_of(timing) == {name}, seed
         value, error = value_of(timing, name, parameter)
@@ -99,7 +99,7 @@ def without_the_middle(stretch):
     ({}, ''), ({'swing': 2e-3}, ''), ({'excess': 1.0, 'rho': 0.7}, 'correlated_jitter'),
     ({'wander': 2.0, 'band': (0.0, 0.2)}, 'phase_wander')])
 def test_what_sets_stretches_apart_has_the_power_of_its_frequency(sizes, name):
-    count, ratios = 20, []
+    count, ratios = 10, []
     for seed in range(count):
         parts = without_the_middle(machine([61, seed], **sizes))
         fit = Chooser(parts, []).fit(frozenset([name] if name else []))
@@ -138,10 +138,10 @@ def test_a_delay_shows_on_either_side_of_what_is_held_out():
 
 
 @pytest.mark.machines
-def test_independent_errors_beside_a_slow_motion_have_no_memory():
+def test_independent_errors_beside_a_slow_motion_have_no_memory(monkeypatch):
     """Errors with a memory explain both at first, so that jitter begins in their place."""
-    timing = read_timing([machine(
-        [64, 0], excess=6.0, wander=6.0, band=(0.0, 0.1), noise=0.6, count=600)])
+    monkeypatch.setattr(Chooser, 'pool', ('jitter_scale', 'correlated_jitter', 'phase_wander'))
+    timing = read_timing([machine([64, 0], excess=6.0, wander=6.0, band=(0.0, 0.1), noise=0.6)])
     assert names_of(timing) == {'excess_jitter', 'phase_wander'}
 
 
@@ -159,7 +159,7 @@ def test_a_beat_within_the_cycles_is_no_acceleration(rng):
 @pytest.mark.parametrize('noise', [0.02, 0.3])
 def test_declared_machine_shows_nothing_beside_what_is_held_out(noise):
     found = [names_of(read_timing(without_the_middle(machine([62, seed], noise=noise))))
-             for seed in range(8)]
+             for seed in range(5)]
     assert not any(found)
 
 
@@ -189,15 +189,16 @@ def test_two_effects_are_told_apart():
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('noise', [0.02, 0.3, 2.0])
-def test_declared_machine_shows_nothing(noise):
-    found = [names_of(read_timing([machine(100 + seed, noise=noise)])) for seed in range(8)]
+def test_declared_machine_shows_nothing_in_noise():
+    found = [names_of(read_timing([machine(100 + seed, noise=2.0)])) for seed in range(8)]
     assert sum(bool(names) for names in found) <= 1
 
 
 @pytest.mark.machines
-def test_checks_are_calibrated_on_the_declared_machine():
-    checks = [read_timing([machine(200 + seed)]).checks for seed in range(12)]
+def test_declared_machine_shows_nothing_and_its_checks_are_calibrated():
+    found = [read_timing([machine(200 + seed)]) for seed in range(12)]
+    assert sum(bool(names_of(timing)) for timing in found) <= 1
+    checks = [timing.checks for timing in found]
     p_values = np.array([each[i].p_value for each in checks for i in (0, 4)])
     assert np.mean(p_values < 0.05) < 0.2
     assert p_values.min() > 1e-4
@@ -206,7 +207,7 @@ def test_checks_are_calibrated_on_the_declared_machine():
 @pytest.mark.machines
 @pytest.mark.parametrize('excess', [0.0, 2.0])
 def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
-    steady = [read_timing([machine(300 + seed, count=1600, excess=excess)]).checks[-1].p_value
+    steady = [read_timing([machine(300 + seed, count=1000, excess=excess)]).checks[-1].p_value
               for seed in range(3)]
     # uniform errors of the same size would scatter less, and make these look unsteady
     assert stats.combine_pvalues(steady).pvalue > 1e-3
@@ -267,7 +268,7 @@ def test_motion_of_a_few_swings_is_a_drift():
 def test_pulse_errors_of_one_band_are_no_random_effect(rng):
     """No sinusoid stands out of them, but their power is that of no effect."""
     frequency = np.fft.rfftfreq(600)
-    for seed in range(3):
+    for seed in range(2):
         part = machine(500 + seed, count=600)
         waves = np.fft.rfft(rng.standard_normal(600))
         band = np.fft.irfft(waves * ((frequency > 0.2) & (frequency < 0.3)), 600)
@@ -284,10 +285,9 @@ def test_memory_is_no_longer_than_a_third_of_a_stretch():
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('effect', [{'shocks': 4.0}, {'hum': 1.5}])
-def test_effect_that_nobody_knows_is_seen(effect):
+def test_effect_that_nobody_knows_is_seen():
     for seed in range(2):
-        timing = read_timing([machine(seed, **effect)])
+        timing = read_timing([machine(seed, hum=1.5)])
         assert min(check.p_value for check in timing.checks) < 1e-4
 
 
@@ -330,11 +330,11 @@ def test_slope_of_the_likelihood_is_that_of_its_differences():
 @pytest.mark.parametrize('name', ['excess_jitter', 'clock_skew'])
 def test_limit_holds_as_often_as_it_says(name):
     # the true size is half the median limit of the declared machine
-    nothing = [limit_of(machine(300 + seed, count=150), name) for seed in range(9)]
+    nothing = [limit_of(machine(300 + seed, count=150), name) for seed in range(7)]
     median = float(np.median(nothing))
     size = {'excess': median / UNIT} if name == 'excess_jitter' else {'skew': median}
     held = [limit_of(machine(400 + seed, count=150, **size), name) >= median
-            for seed in range(24)]
+            for seed in range(16)]
     # 95 %, with four standard errors of such a count
     assert 0.95 - np.mean(held) < 4.0 * np.sqrt(0.95 * 0.05 / len(held))
 
@@ -347,7 +347,7 @@ def test_score_of_the_true_power_is_normal(name, sizes):
     """The power of uniform errors scatters less than that of normal ones."""
     power = 2.0 * np.log(max(sizes.get('excess', 0.0), sizes.get('wander', 0.0)))
     scores = []
-    for seed in range(25):
+    for seed in range(16):
         chooser = Chooser([machine(900 + seed, count=300, **sizes)])
         fit = chooser.fit(frozenset([name]), held={(name, 0): power})
         more, seen = fit.more_than_held(name, chooser.shapes.kurtosis)
@@ -431,11 +431,12 @@ def test_search_for_a_limit_stays_finite_where_smaller_sizes_fit_worse(monkeypat
 
 
 @pytest.mark.machines
-def test_what_no_machine_can_have_is_in_no_set():
+def test_what_no_machine_can_have_is_in_no_set(monkeypatch):
     """Pulses that come by minutes late were recovered wrongly: no delay makes that."""
     part = machine(3, swing=2e-3, count=150)
     speed = 0.02 / np.gradient(part.setting.true_times)
     wrong = replace(part, errors=part.errors + 300.0 * (speed - speed.mean()))
+    monkeypatch.setattr(Chooser, 'pool', ('jitter_scale', 'correlated_jitter', 'path_delay'))
     timing = read_timing([wrong])
     assert timing.choice.fit.value < -1e6  # of all sets: a pattern of minutes is the truth
     assert all(abs(item.effect.delay) <= 1.0 for item in timing.findings

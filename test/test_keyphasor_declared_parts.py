@@ -71,12 +71,12 @@ def test_a_planetary_stage():
 
 @pytest.mark.machines
 def test_random_lines_contradict_nothing_by_chance():
-    """Of 200 machines whose lines are somewhere, beside two harmonics of the mesh."""
+    """Of 100 machines whose lines are somewhere, beside two harmonics of the mesh."""
     rng = np.random.default_rng(1)
-    codes = [item.code for _ in range(200) for item in contradictions(
+    codes = [item.code for _ in range(100) for item in contradictions(
         lines_at(np.concatenate((RATIO * np.array([19.0, 38.0]), rng.uniform(1.0, 150.0, 8)))),
         gearbox())]
-    assert len(codes) <= 2
+    assert not codes
 
 
 @pytest.mark.machines

@@ -97,7 +97,7 @@ def test_a_short_recording_is_averaged_and_says_what_is_too_short(checked, capsy
 
 @pytest.mark.machines
 def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(checked, capsys):
-    text, _ = run_all(checked(48, marks=60, missing=2, torsion=np.radians(3.4)), capsys)
+    text, _ = run_all(checked(24, marks=60, missing=2, torsion=np.radians(3.4)), capsys)
     assert 'averages of 1 recording' in text
 
 
@@ -112,18 +112,18 @@ def from_mark_to_mark(file):
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('each', [False, True])
-@pytest.mark.parametrize('wheel', ['extra', 'three', 'narrow', 'any', 'nearly even'])
+@pytest.mark.parametrize(('wheel', 'each'), [
+    ('extra', False), ('narrow', False), ('any', True), ('nearly even', True)])
 def test_a_wheel_with_marks_at_any_angles_is_taken(checked, tmp_path, capsys, rng, wheel, each):
     """The loop takes the given angles from the pulses, and finds no effect that is none."""
     edges = {
         'extra': np.sort([*np.arange(12) / 12, (rng.integers(12) + rng.uniform(.15, .45)) / 12]),
-        'three': np.array([0.0, 0.31, 0.62]), 'narrow': np.array([0.0, 0.05, 0.12]),
+        'narrow': np.array([0.0, 0.05, 0.12]),
         'any': np.append(0.0, np.cumsum(rng.uniform(0.3, 1.7, 7))),
         'nearly even': (np.arange(8) + rng.uniform(-0.05, 0.05, 8)) / 8}[wheel]
     if wheel == 'any':
         edges = edges[:-1] / edges[-1]
-    folder = copytree(checked(60, edges=tuple(edges), jitter=2e-5, orders=(1, 5, 8, 24)),
+    folder = copytree(checked(40, edges=tuple(edges), jitter=2e-5, orders=(1, 5, 8, 24)),
                       tmp_path / 'rig')
     text, report = run_all(folder, capsys, change=from_mark_to_mark if each else None)
     assert 'averages of 1 recording' in text
@@ -135,18 +135,15 @@ def test_a_wheel_with_marks_at_any_angles_is_taken(checked, tmp_path, capsys, rn
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('each', [False, True])
-def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(
-        checked, tmp_path, capsys, each):
+def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(checked, tmp_path, capsys):
     """Three times the declared jitter, with the size of what is not declared."""
     def change(file):
-        if each:
-            from_mark_to_mark(file)
+        from_mark_to_mark(file)
         text, count = re.subn('jitter_std: .*', 'jitter_std: 4e-5', file.read_text())
         assert count == 1
         file.write_text(text)
 
-    folder = copytree(checked(160, edges=(*np.arange(12) / 12, 11.3 / 12), jitter=1.2e-4,
+    folder = copytree(checked(80, edges=(*np.arange(12) / 12, 11.3 / 12), jitter=1.2e-4,
                               orders=(1, 5, 8, 24)), tmp_path / 'rig')
     _, report = run_all(folder, capsys, change)
     effect, = report['missing_effects']
@@ -215,6 +212,9 @@ RECORDINGS = [
       for name, k in (('weight', 0), ('weight_5', 6), ('without_weight', 3))),
     ('turbine_20130316', {}), ('uia_bearing_rig_1', {}),
     ('encoder_motor_slow', {})]
+#: Marks, missing teeth, clock in Hz and mean speed in Hz, of which the check is told nothing.
+KNOWN = {'gear0_gearbox': (1, 0, None, 33.33), 'motor_30V_100kHz': (8, 0, 100e3, 94.4),
+         'motor_runup_20V_40kHz': (8, 0, 40e3, 39.5), 'turbine_20130316': (2, 0, 1e8, 30.03)}
 
 
 def cut(recording, seconds, channels=None):
@@ -238,7 +238,15 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     if recording.channels > 2:  # all of them would be corrected in every average
         recording, path = cut(recording, 5.0, channels=2), tmp_path / path.name
         write_npz(path, recording)
-    check = keyphasor.check_keyphasor(recording)
+    if name in KNOWN:
+        check = keyphasor.check_keyphasor(replace(recording, pulses_per_revolution=1, orders=()))
+        marks, missing, clock, speed = KNOWN[name]
+        found = {key: item.value for key, item in check.findings.items()}
+        assert (found['pulses_per_revolution'], found['missing_teeth']) == (marks, missing)
+        assert found['speed']['mean'] == pytest.approx(speed, rel=0.005)
+        assert found['clock_rate'] == (clock and pytest.approx(clock, rel=1e-6))
+    else:
+        check = keyphasor.check_keyphasor(recording)
     file = tmp_path / 'machine.yaml'
     file.write_text(machine_file(check, path.name))
     values = averager_values(MachineFile.read(file), recording)
@@ -251,7 +259,7 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     assert (row.error, row.averages > 0) == ('', True)
     for model in read_declaration(file, sample_rate=recording.sample_rate).models.values():
         record_pulses(recording, model)
-        if recording.samples * recording.channels > 60_000:  # of all the loop is slow
+        if recording.samples * recording.channels > 20_000:  # of all the loop is slow
             seen = recording.keyphasor_pulses()
             last = int(2.0 * model.trigger_cycles * model.trigger_revolutions
                        * model.pulses_per_revolution)

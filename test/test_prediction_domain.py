@@ -58,7 +58,7 @@ def anywhere(draw, most_cycles=1_000_000):
                    share / (width * speed), unit)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(anywhere())
 def test_moments_and_quantiles_are_in_order_everywhere(setting):
     prediction = setting.predict()
@@ -174,7 +174,7 @@ def test_single_cycles_are_as_a_quadrature_says():
         assert prediction.standard_deviation[0] == pytest.approx(std, rel=0.01)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=14, deadline=None)
 @given(anywhere(most_cycles=1000), logarithmic(1e-9, 1e-3))
 def test_without_jitter_nothing_is_lost(setting, factor):
     """Mean and standard deviation go to their limits as the square of the errors."""
@@ -216,7 +216,7 @@ NOTHING = {
     'missing_pulses': 'probability'}
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.sampled_from(sorted(NOTHING)), st.sampled_from([0.0, 1e-18, 1e-13]),
        st.sampled_from([1, 5, 12, 40]), logarithmic(1e3, 1e9))
 def test_effects_of_no_size_change_nothing(name, size, cycles, rate):

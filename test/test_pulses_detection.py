@@ -10,7 +10,7 @@
 
 """From keyphasor waveform to pulse times: exact crossings, any cutting, real tachos, bad input."""
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -72,6 +72,7 @@ def test_threshold_given_without_hysteresis_needs_no_learning():
     assert pulses.size == 1
 
 
+@settings(max_examples=20)
 @given(cuts=st.lists(st.integers(0, 20_000), max_size=40),
        edge=st.sampled_from(['rising', 'centre']), interpolate=st.booleans(),
        seed=st.integers(0, 3))

@@ -13,7 +13,7 @@
 from itertools import pairwise
 import warnings
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -229,7 +229,8 @@ def hurt(rng, angle, turn):
     pytest.param(kind, marks=pytest.mark.machines)
     for kind in ('turn', 'none', 'reset each turn', 'overflow of 8 bits'))])
 @given(st.integers(0, 2**31))
-@settings(max_examples=20, deadline=None)
+@example(107429)  # glitches that stand out of few deviations
+@settings(max_examples=7, deadline=None)
 def test_glitches_anywhere_leave_the_pulses_and_any_cut_is_the_same(kind, seed):
     rng = np.random.default_rng(seed)
     make, stamps, angle, turn, rate, tick = machine(rng, kind)

@@ -570,10 +570,11 @@ def test_a_clean_encoder_on_a_machine_that_turns_unevenly_loses_next_to_nothing(
         found, *_, counts = validate(pulses, pulses_per_revolution=16)
         assert np.isin(found, pulses).all()
         lost += pulses.size - counts.accepted + counts.missing_broken + 16 * counts.late
-        cuts = np.sort(np.random.default_rng(seed).integers(0, pulses.size, 40))
-        parts, *_, of_parts = validate(pulses, cuts, pulses_per_revolution=16)
-        assert np.array_equal(parts, found)
-        assert of_parts == counts
+        if seed == 0:
+            cuts = np.sort(np.random.default_rng(seed).integers(0, pulses.size, 40))
+            parts, *_, of_parts = validate(pulses, cuts, pulses_per_revolution=16)
+            assert np.array_equal(parts, found)
+            assert of_parts == counts
     assert lost <= 0.01 * 3 * 800
 
 
@@ -614,10 +615,10 @@ def test_lost_pulses_beside_jitter_are_missing(jitter):
 def test_missing_pulses_are_no_speed_that_scatters(share):
     """Of one mark with jitter of up to 3 %, from which up to a third of the pulses is missing."""
     wrong = found = 0
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         marks = np.arange(600) / 30.0
-        pulses = (marks + rng.choice([1e-4, 1e-2, 3e-2]) / 30.0 * rng.normal(size=600))
+        pulses = (marks + (1e-4, 1e-2, 3e-2)[seed % 3] / 30.0 * rng.normal(size=600))
         given = pulses[rng.random(600) > share]
         _, runs, *_ = validate(given)
         turns = np.concatenate([np.diff(np.searchsorted(pulses, run)) for run in runs])

@@ -29,7 +29,7 @@ from scipy import stats
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=20.0, trigger_cycles=20,
                       orders=(20.0, 60.0, 120.0), ratio=1.5)
 OTHERS = ('quadratic', 'spline')
-DRAWS = 300
+DRAWS = 200
 U, W = np.polynomial.legendre.leggauss(16)
 U, W = 0.5 * (U + 1.0), 0.5 * W
 SKEWED = tuple(np.random.default_rng(12).exponential(4e-5, 400))
@@ -92,11 +92,11 @@ def test_a_model_refuses_an_unknown_law():
         replace(MODEL, angle_law='cubic')
 
 
-@pytest.mark.parametrize('law', OTHERS)
-@pytest.mark.parametrize('changes', [
-    {}, {'trigger_cycles': 4}, {'jitter_distribution': 'normal', 'trigger_cycles': 12},
-    {'jitter_distribution': 'table', 'jitter_table': SKEWED}],
-    ids=['uniform', 'few cycles', 'normal', 'skewed'])
+@pytest.mark.parametrize(('law', 'changes'), [
+    ('quadratic', {'trigger_cycles': 4}),
+    ('spline', {'jitter_distribution': 'normal', 'trigger_cycles': 12}),
+    ('quadratic', {}), ('spline', {'jitter_distribution': 'table', 'jitter_table': SKEWED})],
+    ids=['few cycles', 'normal', 'uniform', 'skewed'])
 def test_prediction_is_what_the_law_makes_of_jitter(law, changes, rng):
     model = replace(MODEL, angle_law=law, **changes)
     pulses = even(model)
