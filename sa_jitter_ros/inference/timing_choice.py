@@ -36,7 +36,7 @@ from sa_jitter_ros.effects.timing import (
     FAINT, LARGE, MOTION, Pattern, PULSES, Setting, SOURCE, Spectrum)
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
-from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
+from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
 
 #: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
@@ -52,8 +52,9 @@ EXCESS = 'excess_jitter'
 NO_EFFECTS = RIPPLE, SIDEBANDS, BAND, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
-# Logarithms of power and width, and of half the order, from which one of these is sought.
-_EDGES = (0.0, math.log(0.3), 1.4), (-4.0, math.log(0.1), 2.0), (-4.0, math.log(0.05), 2.0)
+# Logarithms of power and width, and of half the order, from which one of these is sought, beside
+# the rest of the motion and beside one of so much less, in its logarithm.
+_EDGES, _LESS = ((0.0, math.log(0.3), 1.4), (3.0, math.log(0.1), 1.4)), 6.0
 _STEP = 0.01  # of the tick by which the size of a pattern is varied, to either side
 
 
@@ -325,6 +326,9 @@ class Chooser:
         new = [[*([(name, start[name])] if name in start else []),
                 *((name, np.array(first)) for first in item.starts)]
                for name, item in spectra.items() if anew or name not in start]
+        if BAND in spectra and BAND not in start and SHAFT in start:
+            less = start[SHAFT] - _LESS * (np.arange(start[SHAFT].size) < start[SHAFT].size - 1)
+            new.append([(SHAFT, start[SHAFT]), (SHAFT, less)])
         found = max((TimingFit(
             self.data, spectra, patterns, scaled=JITTER in names, fixed=fixed,
             known=known, start={**start, **dict(some)}, held=held) for some in product(*new)),
