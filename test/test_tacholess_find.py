@@ -110,7 +110,7 @@ def test_used_orders_are_too_large_and_others_too_small():
         rows.append(row)
     measured, factor = np.moveaxis(rows, 2, 0)
     assert np.all((factor > 1.0) == [True, False])
-    # over 20 machines the standard deviations are 0.018 of an average, 0.0015 of a difference
+    # the standard deviations of machines are 0.018 of an average, 0.0015 of a difference
     assert np.all(np.abs((measured - factor).mean(axis=0)) < 3.0 * 0.018 / np.sqrt(len(rows)))
     difference = np.diff(measured - factor)
     assert abs(difference.mean()) < 3.0 * 0.0015 / np.sqrt(len(rows)) < 0.5 * np.mean(
