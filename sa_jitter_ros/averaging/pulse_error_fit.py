@@ -170,7 +170,7 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
     u = np.arange(length) / length
     nodes, columns = [], [np.ones((len(u), 1))]
     for g in orders:
-        x, through_nodes = _through_nodes(nodes_for(g * spread), length)
+        x, through_nodes = _through_nodes(nodes_for(g * spread), u)
         wave = np.exp(2j * pi * g * cycle_length * u)[:, None] * through_nodes
         nodes.append(x)
         columns += [wave.real, -wave.imag]
@@ -191,19 +191,22 @@ def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, order
                             start, grid)
 
 
-@lru_cache(maxsize=32)
-def _through_nodes(count: int, length: int) -> tuple[FloatArray, FloatArray]:
+def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     Return Gauss nodes in [0, 1] and the polynomials (u, node) that are 1 at one node each.
 
-    There are `length` values u = i / length. The polynomials are sums of Legendre polynomials, for
-    whose products Gauss quadrature is exact.
+    They are sums of Legendre polynomials, for whose products Gauss quadrature is exact.
     """
+    x, at_nodes = _at_nodes(count)
+    sums = legendre.legvander(2.0 * u - 1.0, count - 1) * (np.arange(count) + 0.5)
+    return 0.5 + 0.5 * x, sums @ at_nodes.T
+
+
+@lru_cache(maxsize=_MOST_NODES)
+def _at_nodes(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return Gauss nodes in [-1, 1], and Legendre polynomials (node, degree) there, weighted."""
     x, weight = legendre.leggauss(count)
-    sizes = np.arange(count) + 0.5
-    at_nodes = legendre.legvander(x, count - 1) * weight[:, None]
-    u = np.arange(length) / length
-    return 0.5 + 0.5 * x, (legendre.legvander(2.0 * u - 1.0, count - 1) * sizes) @ at_nodes.T
+    return x, legendre.legvander(x, count - 1) * weight[:, None]
 
 
 def variance_within(covariance: FloatArray, u: FloatArray, begins: NDArray[np.int64]
@@ -329,8 +332,7 @@ class PulseErrorProblem:
             converged = np.all(moved < _CONVERGED * np.abs(amplitudes[self.significant]))
             if converged and np.max(np.abs(step)) < 0.02 * np.sqrt(np.min(covariance[0])):
                 break
-        none = log_likelihood(information, np.zeros_like(pull), np.array([std])).item()
-        evidence = none + 0.5 * (
+        evidence = log_likelihood(information, 0.0 * pull, np.array([std])).item() + 0.5 * (
             self._misfit_without_errors(weight) - np.sum(residual**2)
             - np.sum(errors**2) / std**2
             + np.log(information.times(np.ones(len(pull))).sum()))
