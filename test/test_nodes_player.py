@@ -341,6 +341,23 @@ def test_player_waits_for_subscribers(ros_graph, clock, tmp_path, recording):
     assert 'playing' in node.summary()[0]
 
 
+def test_player_that_was_paused_waits_for_subscribers_when_it_is_to_play(
+        ros_graph, clock, tmp_path, recording):
+    write_npz(tmp_path / 'rig.npz', recording)
+    node = ros_graph.add(RecordingPlayer, {
+        'recording': str(tmp_path / 'rig.npz'), 'wait_seconds': 0.5, 'playing': False})
+    clock.now += 100.0
+    node._tick()
+    assert 'paused' in node.summary()[0]
+    node.set_parameters([Parameter('playing', value=True)])
+    clock.now += 0.4
+    node._tick()
+    assert 'waiting' in node.summary()[0]
+    clock.now += 0.2
+    node._tick()
+    assert 'playing' in node.summary()[0]
+
+
 def test_pacer_follows_clock_and_rate_and_skips_a_lag():
     pacer = Pacer(2.0)
     assert pacer.due(100.0) == 0.0

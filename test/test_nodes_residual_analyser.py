@@ -390,6 +390,14 @@ def test_averages_with_unresolved_pulses_are_counted(bench):
     assert b.diagnostics()[2]['averages_with_unresolved_pulses'] == '10'
 
 
+def test_a_batch_too_small_for_a_cause_says_how_many_it_takes(bench):
+    b = bench(acquisitions=3)
+    b.predict()
+    b.average(synthetic(3))
+    assert b.spin(lambda: b.reported('3 averages at once tell no cause, at least 4 do'))
+    assert not b.reported('ambiguous')
+
+
 def test_silent_inputs_are_named(bench, monkeypatch):
     clock = SteadyClock()
     monkeypatch.setattr(health, 'time', clock)

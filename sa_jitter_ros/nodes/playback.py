@@ -99,7 +99,7 @@ class PlaybackNode(MonitoringNode):
         self._waveform: Any = None
         self._pacer = Pacer(values['rate'])
         self._playing, self._started = values['playing'], False
-        self._created, self._idle_until = time.monotonic(), 0.0
+        self._asked, self._idle_until = time.monotonic(), 0.0
         self._wait = values['wait_seconds']
         self._sent = 0.0
         self._progress_time = -math.inf
@@ -147,6 +147,8 @@ class PlaybackNode(MonitoringNode):
         if values['playing'] and not self._playing and self._stream is None:
             self._stream = self.portions()  # the stream has ended: play it again
             self.set_fault('stream', '')
+        if values['playing'] and not self._playing:
+            self._asked = time.monotonic()
         self._playing = values['playing']
         self._timer.timer_period_ns = round(self._period(values['rate']) * 1e9)
         self._pacer.run(time.monotonic(), rate=values['rate'],
@@ -185,12 +187,12 @@ class PlaybackNode(MonitoringNode):
         self._log_progress()
 
     def _may_start(self) -> bool:
-        """Start when vibration and keyphasor have subscribers, or after `wait_seconds`."""
+        """Start when vibration and keyphasor have subscribers, or have had `wait_seconds` to."""
         tach = [] if self._tach_pulse is None else [self._tach_pulse.subscribers]
         tach += [] if self._waveform is None else [self._waveform.get_subscription_count()]
         subscribed = self._vibration.get_subscription_count() > 0 and (not tach or any(tach))
         now = time.monotonic()
-        self._started = subscribed or now - self._created >= self._wait
+        self._started = subscribed or now - self._asked >= self._wait
         if self._started:
             self._pacer.run(now, rate=self._pacer.rate, running=True)
         return self._started

@@ -200,7 +200,9 @@ class ResidualAnalyser(MonitoringNode):
         self.set_missing('cause', '' if len(averages) - ambiguous >= _FEWEST else (
             f'{ambiguous} of {len(averages)} averages have pulses whose error the vibration '
             'leaves ambiguous, and tell no cause: declare stronger or lower orders in the '
-            'averager, or use a better keyphasor'))
+            'averager, or use a better keyphasor') if ambiguous else (
+            f'{len(averages)} averages at once tell no cause, at least {_FEWEST} do: raise '
+            'acquisitions'))
         self._batch.averages.clear()
         self._batches += 1
         self._significant = found.p_surest < _SIGNIFICANT
