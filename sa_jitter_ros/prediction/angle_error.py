@@ -36,8 +36,9 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.pulses.angle_law import Covariance, LINEAR, PulseWeights
+from scipy.linalg.lapack import dpstrf
 
-_RANK = 1e-9  # variance of what is left out of drawn processes, over the largest component's
+_RANK = 1e-9  # variance of what is left out of a drawn process, in parts of its variance
 
 
 class AngleErrorProcess(Protocol):
@@ -178,9 +179,10 @@ def _root(covariance: bytes, cycles: int) -> NDArray[np.float32]:
     lags = np.arange(cycles) - np.arange(cycles)[:, None]
     both = np.concatenate((blocks, blocks[:0:-1].transpose(0, 2, 1)))  # negative lags count back
     matrix = both[lags].transpose(0, 2, 1, 3).reshape(cycles * points, -1)
-    size, axes = np.linalg.eigh(matrix)
-    kept = size > _RANK * size[-1]
-    factor = np.asarray(axes[:, kept] * np.sqrt(size[kept]), np.float32)
+    # by pivots, of which a band needs few: eigenvalues of all points would take seconds
+    lower, pivots, rank, _ = dpstrf(matrix, tol=_RANK * matrix.max(), lower=1)
+    factor = np.empty((len(matrix), rank), np.float32)
+    factor[pivots - 1] = np.tril(lower)[:, :rank]
     factor.flags.writeable = False
     return factor
 
