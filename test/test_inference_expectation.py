@@ -20,7 +20,7 @@ from sa_jitter_ros.inference.expectation import (
     _leakage, _sharpening, expect, Lines, RESOLUTION)
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
+from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter, unit_nodes
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import AveragePulses, Influence, random_processes
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -108,10 +108,32 @@ def test_loop_scores_with_the_published_distribution(name, cycles, law):
         np.testing.assert_allclose(found.cdf(quantile[None])[0],
                                    published.cdf(quantile[:, None])[:, 0], atol=1e-4)
     bare = predict(replace(model, noise_std=0.0), [
-        effect for effect in effects if effect.name != 'additive_noise'])
+        effect for effect in effects  # an average and its corrected one share the gain
+        if effect.name not in ('additive_noise', 'amplitude_modulation')])
     np.testing.assert_allclose(found.attenuation[0], bare.mean_attenuation, rtol=1e-6)
     np.testing.assert_allclose(found.attenuation_variance[0], bare.variance + RESOLUTION**2,
                                rtol=1e-5)
+
+
+@pytest.mark.parametrize('std', [0.05, 0.2])
+def test_a_gain_scatters_amplitudes_and_not_what_pulse_errors_cost(std, rng):
+    model, draws = replace(MODEL, noise_std=0.0), 6000
+    gain = make_effect('amplitude_modulation', std=std, bandwidth=0.3)
+    cycles, (u, weight) = model.trigger_cycles, unit_nodes(8)
+    found = expected(model, [Unknown(gain)], [AveragePulses(np.full(cycles + 1, np.nan))])
+    (process,) = gain.processes(model)
+    gains = process.draw_gain(rng, cycles, u, draws)
+    errors = model.fundamental_frequency * model.distribution.draw(rng, (cycles + 1, 1, draws))
+    along = errors[:-1] * (1.0 - u[:, None]) + errors[1:] * u[:, None]
+    corrected = weight @ gains.mean(axis=0)
+    for line, order in enumerate(ORDERS):
+        raw = np.abs(weight @ np.mean(gains * np.exp(2j * np.pi * order * along), axis=0))
+        ratio = raw / corrected
+        assert found.attenuation[0, line] == pytest.approx(ratio.mean(), abs=5e-4)
+        # cycles of unequal weights are so many fewer; a variance of 6000 draws is known to 2 %
+        assert found.attenuation_variance[0, line] - RESOLUTION**2 == pytest.approx(
+            ratio.var() / (1.0 + std**2), rel=0.08)
+        assert found.amplitude_variance[0, line] == pytest.approx(raw.var(), rel=0.08)
 
 
 @pytest.mark.parametrize('wander', [False, True])

@@ -136,32 +136,34 @@ class Expectation:
     Predicted distributions of the lines, arrays (acquisition, line).
 
     `attenuation` and `attenuation_variance` are those of raw over corrected amplitude, without
-    noise; `amplitude` and `amplitude_variance` those of the raw amplitude over its level, noise
-    and unsteadiness included, of which `cdf` is the distribution function.
+    noise, and without gains, which both have (`ungained`); `amplitude` and `amplitude_variance`
+    those of the raw amplitude over its level, noise, gains and unsteadiness included, of which
+    `cdf` is the distribution function.
     """
 
     shown: tuple[_Shown, ...] = field(repr=False)
+    ungained: tuple[_Shown, ...] = field(repr=False)
     noise: Array
 
     @cached_property
     def attenuation(self) -> Array:
         """Return E|X|."""
-        return self._gathered(self._bare, 'mean')
+        return self._gathered(self.ungained, self._bare, 'mean')
 
     @cached_property
     def attenuation_variance(self) -> Array:
         """Return Var|X| plus the variance that comes from resampling."""
-        return self._gathered(self._bare, 'variance') + RESOLUTION**2
+        return self._gathered(self.ungained, self._bare, 'variance') + RESOLUTION**2
 
     @cached_property
     def amplitude(self) -> Array:
         """Return E|X + n|."""
-        return self._gathered(self._full, 'mean')
+        return self._gathered(self.shown, self._full, 'mean')
 
     @cached_property
     def amplitude_variance(self) -> Array:
         """Return Var|X + n|."""
-        return self._gathered(self._full, 'variance')
+        return self._gathered(self.shown, self._full, 'variance')
 
     def cdf(self, amplitude: Array) -> Array:
         """Return P(|X + n| <= amplitude) for an amplitude (acquisition, line) each."""
@@ -184,7 +186,7 @@ class Expectation:
     @cached_property
     def _bare(self) -> list[Distribution]:
         return [item.distribution(np.arange(item.index.size), np.zeros(item.index.size),
-                                  self._most) for item in self.shown]
+                                  self._most) for item in self.ungained]
 
     @cached_property
     def _full(self) -> list[Distribution]:
@@ -196,9 +198,10 @@ class Expectation:
         size = self.noise.size
         return max(COARSEST, min(max(_ENOUGH, _MANY_VALUES // size), _MOST_VALUES // size))
 
-    def _gathered(self, distributions: Sequence[Distribution], name: str) -> Array:
+    def _gathered(self, shown: Sequence[_Shown], distributions: Sequence[Distribution], name: str
+                  ) -> Array:
         values = np.empty(self.noise.size)
-        for item, distribution in zip(self.shown, distributions):
+        for item, distribution in zip(shown, distributions):
             values[item.index] = getattr(distribution, name)
         return values.reshape(self.noise.shape)
 
@@ -216,28 +219,34 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
     """
     memory = Memory() if memory is None else memory
     memory.make_room()
-    key = tuple(effects)
-    alike: dict[float, list[int]] = {}
-    for a in chosen:
-        if (key, a) not in memory.shown:
-            speed = _speed(observation.acquisitions[a], observation.model)
-            alike.setdefault(speed, []).append(a)
-    for speed, some in alike.items():
-        setting = _setting(observation, speed, effects)
-        found = iter(setting.shown([item for a in some for item in pulses[a]]))
-        for a in some:
-            memory.keep((key, a), [
-                _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
-                for i, _ in enumerate(pulses[a])])
-        for amplitudes in setting.made:
-            memory.count(amplitudes)
-    shown = _together([[replace(item, index=item.index + n * lines.count)
-                        for item in memory.shown[key, a]] for n, a in enumerate(chosen)])
+
+    def shown_by(key: tuple[Influence, ...]) -> tuple[_Shown, ...]:
+        alike: dict[float, list[int]] = {}
+        for a in chosen:
+            if (key, a) not in memory.shown:
+                speed = _speed(observation.acquisitions[a], observation.model)
+                alike.setdefault(speed, []).append(a)
+        for speed, some in alike.items():
+            setting = _setting(observation, speed, key)
+            found = iter(setting.shown([item for a in some for item in pulses[a]]))
+            for a in some:
+                memory.keep((key, a), [
+                    _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
+                    for i, _ in enumerate(pulses[a])])
+            for amplitudes in setting.made:
+                memory.count(amplitudes)
+        return _together([[replace(item, index=item.index + n * lines.count)
+                           for item in memory.shown[key, a]] for n, a in enumerate(chosen)])
+
+    shown = shown_by(tuple(effects))
+    ungained = tuple(item for item in effects if not any(
+        hasattr(process, 'draw_gain') for process in item.processes(observation.model)))
     noise = np.zeros(len(chosen) * lines.count)
     for item in shown:
         noise[item.index] = item.noise
     own = 2.0 * (unsteadiness**2 + RESOLUTION**2)  # half of it along the radius
-    return Expectation(shown, noise.reshape(len(chosen), -1) / level**2 + own)
+    return Expectation(shown, shown_by(ungained) if len(ungained) < len(effects) else shown,
+                       noise.reshape(len(chosen), -1) / level**2 + own)
 
 
 def _together(rows: Sequence[Sequence[_Shown]]) -> tuple[_Shown, ...]:

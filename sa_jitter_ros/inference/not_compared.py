@@ -49,7 +49,7 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     excludes still has a limit; whatever that leaves is undecided.
     """
     count = len(observation.acquisitions)
-    none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
+    none, nothing = np.zeros(0, np.intp), Expectation((), (), np.zeros((count, 0)))
     fit, held_out = parted(count)
     parts = stretches(observation, range(count), NO_CLOCK) if observation.recoveries else []
     coherent = choose_lines(observation).count > 0  # else no line holds the angle to the pulses
