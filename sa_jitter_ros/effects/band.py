@@ -14,6 +14,7 @@ Slow random motions whose spectrum is flat in a band, and what recovered pulse e
 Frequencies are in units of the trigger rate, times in trigger cycles.
 """
 
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -102,7 +103,7 @@ def ripple_of_acceleration(band: tuple[float, float]) -> float:
 
     It is 1/2, that of a constant one, less what changes within the cycle.
     """
-    return float(np.sqrt(_ripple_covariance(band, 0)))
+    return math.sqrt(_ripple_covariances(band)[0])
 
 
 def band_of_ripple(correlation: Array) -> Array:
@@ -115,14 +116,17 @@ def band_of_ripple(correlation: Array) -> Array:
 
 def ripple_correlation(band: tuple[float, float]) -> float:
     """Return the correlation of neighbouring ripples that an acceleration in a band makes."""
-    return _ripple_covariance(band, 1) / _ripple_covariance(band, 0)
+    variance, neighbours = _ripple_covariances(band)
+    return neighbours / variance
 
 
-def _ripple_covariance(band: tuple[float, float], lag: int) -> float:
-    """Return the autocovariance of the recovered ripple of a unit acceleration."""
+@lru_cache(maxsize=1024)
+def _ripple_covariances(band: tuple[float, float]) -> tuple[float, float]:
+    """Return variance and covariance of neighbours of the ripple of a unit acceleration."""
     frequency, weight = even_in(band)
     gain = np.abs(recovered(frequency, frequency)[:, 1]) / (2.0 * np.pi * frequency) ** 2
-    return float(weight @ (gain**2 * np.cos(2.0 * np.pi * frequency * lag)))
+    power = weight * gain**2
+    return float(power.sum()), float(power @ np.cos(2.0 * np.pi * frequency))
 
 
 def even_in(band: tuple[float, float]) -> tuple[Array, Array]:
