@@ -145,8 +145,8 @@ def offset_of(center: Array, mean_along: Array, mean_across: Array, along: Array
 
     The difference of the squares keeps the digits that the difference of the lengths loses.
     """
-    square = (2.0 * (mean_along * along + mean_across * across) + along**2 + across**2)
-    total = np.hypot(mean_along + along, mean_across + across) + center
+    square = along * (2.0 * mean_along + along) + across * (2.0 * mean_across + across)
+    total = np.sqrt((mean_along + along) ** 2 + (mean_across + across) ** 2) + center
     return np.asarray(square / np.where(total > 0.0, total, 1.0))
 
 

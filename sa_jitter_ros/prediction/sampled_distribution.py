@@ -305,15 +305,14 @@ def _calibrated(controls: Array) -> Array:
     count = controls.shape[-1]
     mean = controls.mean(axis=-1, keepdims=True)
     controls -= mean
-    scale = np.sqrt(np.einsum('oid,oid->oi', controls, controls) / count)[..., None]
+    products = controls @ controls.transpose(0, 2, 1) / count
+    scale = np.sqrt(np.diagonal(products, axis1=1, axis2=2))[..., None]
     known = np.abs(mean) < _BELIEVED / math.sqrt(count) * scale
     factor = np.where(known, 1.0 / np.where(known, scale, 1.0), 0.0)
-    off = np.empty(controls.shape, np.float32)
-    np.multiply(controls, factor, out=off, casting='same_kind')
-    normal = (off @ off.transpose(0, 2, 1)).astype(float) / count
+    normal = factor * products * factor.transpose(0, 2, 1)
     inverse = np.linalg.pinv(normal, rcond=_COLLINEAR, hermitian=True)
-    slope = (mean * factor).transpose(0, 2, 1) @ inverse
-    return np.asarray((1.0 - (slope.astype(np.float32) @ off)[:, 0]) / count, float)
+    slope = ((mean * factor).transpose(0, 2, 1) @ inverse) * factor.transpose(0, 2, 1)
+    return np.asarray((1.0 - (slope @ controls)[:, 0]) / count)
 
 
 def _linear_cycles(angle: Array) -> tuple[Array, Array]:
@@ -355,10 +354,11 @@ def _less_than_sine(half: Array) -> Array:
 def _bent_cycles(angle: Array, weights: Array, swell: Array | None) -> tuple[Array, Array]:
     """Return the same of angles (cycle, place, draw) at places of such weights, with a gain."""
     w = weights.astype(angle.dtype)
-    real, imag = -2.0 * np.sin(0.5 * angle) ** 2, np.sin(angle)
-    if swell is not None:
-        real, imag = swell * real + (swell - 1.0), swell * imag
-    return w @ real, w @ imag
+    half, imag = np.sin(0.5 * angle), np.sin(angle)
+    half *= half
+    if swell is None:
+        return -2.0 * (w @ half), w @ imag
+    return w @ (swell - 1.0 - 2.0 * swell * half), w @ (swell * imag)
 
 
 def require_probabilities(probability: ArrayLike) -> Array:
