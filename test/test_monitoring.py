@@ -10,8 +10,10 @@
 
 """Has the machine changed: the statistics of the test, and the baseline in its file."""
 
+from copy import deepcopy
 from dataclasses import replace
 import errno
+from functools import cache
 import math
 import os
 from types import SimpleNamespace
@@ -94,7 +96,7 @@ LAWS = {
 @pytest.mark.machines
 @pytest.mark.parametrize('law', LAWS)
 def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
-    shape, length = (80, 8), 2000 if law == 'unsteady' else 1000  # it takes longer to learn
+    shape, length = (40, 8), 2000 if law == 'unsteady' else 1000  # it takes longer to learn
     found, expected = alarms_of(
         LAWS[law](np.random.default_rng(7), shape), units=shape[0], quantities=shape[1],
         learning=40, scores=0.5 * length, length=length)
@@ -106,7 +108,7 @@ def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
 @pytest.mark.machines
 def test_slow_unsteadiness_below_the_noise_is_learnt():
     """What a prediction from the last score misses costs alarms until 32 groups have shown it."""
-    shape, scores = (80, 8), 2000.0
+    shape, scores = (40, 8), 2000.0
     draw = smooth(np.random.default_rng(8), shape, 0.95, 2.0)
     test, unknown, alarms = ChangeTest(shape, learning=40), np.full(shape, np.nan), []
     for number in range(3000):
@@ -229,6 +231,19 @@ def test_threshold_follows_from_the_rate_of_averages_and_of_false_alarms():
 
 # --- changes -------------------------------------------------------------------------------------
 
+@cache
+def watched_once(seed):
+    """Return a machine and its monitor after 400 averages, which are not to change."""
+    machine = Machine(seed)
+    monitor = machine.monitor()
+    assert machine.run(monitor, 400) == []
+    return machine, monitor
+
+
+def watched(seed):
+    """Return a machine and its monitor after 400 averages."""
+    return deepcopy(watched_once(seed))
+
 
 def test_change_is_found_where_it_is_with_its_size_and_its_beginning():
     machine = Machine(2)
@@ -252,9 +267,7 @@ def test_change_is_found_where_it_is_with_its_size_and_its_beginning():
 
 
 def test_indicators_change_too_and_fall():
-    machine = Machine(3)
-    monitor = machine.monitor()
-    machine.run(monitor, 400)
+    machine, monitor = watched(20)
     machine.damage[0, 1] = 0.94
     line, = machine.run(monitor, 100)
     assert line.startswith('kurtosis of input, channel 0: -')
@@ -293,9 +306,7 @@ def test_what_came_since_a_change_is_no_part_of_the_baseline():
 
 
 def test_change_that_ends_is_taken_back():
-    machine = Machine(5)
-    monitor = machine.monitor()
-    machine.run(monitor, 400)
+    machine, monitor = watched(20)
     machine.gain[0, 1] = 1.05
     assert len(machine.run(monitor, 100)) == 1
     machine.gain[0, 1] = 1.0
@@ -305,9 +316,7 @@ def test_change_that_ends_is_taken_back():
 
 
 def test_one_wild_average_is_no_change_and_spoils_no_baseline():
-    machine = Machine(6)
-    monitor = machine.monitor()
-    machine.run(monitor, 400)
+    machine, monitor = watched(20)
     scatter = monitor.baseline(16.6).scatter
     machine.gain[:] = machine.damage[:] = 30.0
     assert machine.run(monitor, 1) == []
@@ -347,9 +356,7 @@ def test_absent_order_has_a_baseline_without_bias():
 def test_worse_keyphasor_is_no_change_of_the_machine(worse):
     alarms = []
     for seed in range(3):
-        machine = Machine(20 + seed)
-        monitor = machine.monitor()
-        machine.run(monitor, 400)
+        machine, monitor = watched(20 + seed)
         for name, value in worse.items():
             setattr(machine, name, value)
         alarms += machine.run(monitor, 400)

@@ -545,13 +545,13 @@ class Chain:
 
     def play(self, until):
         """
-        Play the machine in blocks of a quarter of a second until something has happened.
+        Play the machine in blocks of a second until something has happened.
 
         The machine stands still while the analyser traces or asks the predictor, so that the speed
         of the computer changes nothing.
         """
-        size = int(self.rate) // 4
-        for _ in range(600):
+        size = int(self.rate)
+        for _ in range(150):
             assert self.graph.spin(lambda: not self.analyser._activity, timeout=600.0)
             if until():
                 return
