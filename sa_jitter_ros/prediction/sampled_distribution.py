@@ -197,14 +197,14 @@ def drawn_averages(orders: ArrayLike, processes: Sequence[Any], trigger_cycles: 
              if hasattr(process, 'draw_angle')]
     gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
              if hasattr(process, 'draw_gain')]
-    swell = np.prod(gains, axis=0) if gains else None
     few = (bare or trigger_cycles <= _LUMPY) and any(map(_of_few_values, pulsed))
     kind = np.float32 if _NARROW < spread < _WIDE and not few else np.float64
+    swell = (np.prod(gains, axis=0) - 1.0).astype(kind, order='C') if gains else None
 
     def averages(errors: Array) -> Array:
         angle = errors if bare else (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
                                      + sum(extra))
-        angle = (2.0 * np.pi * angle).astype(kind)
+        angle = (2.0 * np.pi * angle).astype(kind, order='C')
         if chords and not bare:
             angle = angle.transpose(1, 0, 2).reshape(u.size, -1)
         draws = np.empty((g.size, count), complex)
@@ -352,13 +352,17 @@ def _less_than_sine(half: Array) -> Array:
 
 
 def _bent_cycles(angle: Array, weights: Array, swell: Array | None) -> tuple[Array, Array]:
-    """Return the same of angles (cycle, place, draw) at places of such weights, with a gain."""
+    """Return the same of angles (cycle, place, draw) at places of such weights, and a gain - 1."""
     w = weights.astype(angle.dtype)
-    half, imag = np.sin(0.5 * angle), np.sin(angle)
-    half *= half
-    if swell is None:
-        return -2.0 * (w @ half), w @ imag
-    return w @ (swell - 1.0 - 2.0 * swell * half), w @ (swell * imag)
+    real, imag = np.empty((2, len(angle), angle.shape[2]), angle.dtype)
+    for k, turned in enumerate(angle):  # one cycle after the other stays in the cache
+        less, across = np.sin(0.5 * turned), np.sin(turned)
+        less *= -2.0 * less
+        if swell is not None:
+            less += swell[k] * (1.0 + less)
+            across += swell[k] * across
+        real[k], imag[k] = w @ less, w @ across
+    return real, imag
 
 
 def require_probabilities(probability: ArrayLike) -> Array:
