@@ -33,6 +33,7 @@ from sa_jitter_ros.loop import close_loop
 
 EFFECTS = ('', 'excess_jitter', 'correlated_jitter', 'target_geometry', 'clock_skew',
            'phase_wander')
+WAYS = ('channels', 'cut')
 _MOST_CYCLES = 900  # of a machine, which take some seconds
 
 
@@ -75,7 +76,7 @@ def draw(effect: str, seed: int) -> tuple[dict[str, Any], str]:
         seed += 1
 
 
-def compare(effect: str, seed: int, folder: Path) -> dict[str, str]:
+def compare(effect: str, seed: int, folder: Path, wanted: Sequence[str] = WAYS) -> dict[str, str]:
     """Return how the answers for other channels and cuts differ, '' for not at all."""
     fields, text = draw(effect, seed)
     model = folder / 'model.yaml'
@@ -85,7 +86,8 @@ def compare(effect: str, seed: int, folder: Path) -> dict[str, str]:
             'channels': [dict(fields, vibration=fields['vibration'][::-1])],
             'cut': cut(fields, share)}
     answers = {}
-    for name, pieces in ways.items():
+    for name in ('as recorded', *wanted):
+        pieces = ways[name]
         files = [folder / f'{name} {number}.npz' for number in range(len(pieces))]
         for file, piece in zip(files, pieces):
             np.savez(file, **piece)
@@ -108,12 +110,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--effects', nargs='*', default=EFFECTS)
     parser.add_argument('--machines', type=int, default=4, help='of each effect')
     parser.add_argument('--first', type=int, default=40_000, help='seed of the first machine')
+    parser.add_argument('--ways', nargs='*', default=WAYS, choices=WAYS)
     options = parser.parse_args(arguments)
     rows = []
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter('ignore')
         for effect in options.effects:
-            rows += [compare(effect, options.first + 100 * k, Path(folder))
+            rows += [compare(effect, options.first + 100 * k, Path(folder), options.ways)
                      for k in range(options.machines)]
     for way in rows[0]:
         alike = sum(not row[way] for row in rows)

@@ -235,7 +235,7 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     """Other warnings than those for users, as numpy gives them, are errors in all tests."""
     path = shared_data / f'{name}.npz'
     recording = read(path, pulses_suffice=True, **fields)
-    if recording.channels > 2:  # all of them would be corrected in every average
+    if recording.samples * recording.channels > 1_000_000:  # all would be corrected
         recording, path = cut(recording, 5.0, channels=2), tmp_path / path.name
         write_npz(path, recording)
     if name in KNOWN:

@@ -10,9 +10,11 @@
 
 """What the figures of the reproduction have in common."""
 
+from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,12 @@ def panels(columns: int, rows: int = 1, *, height: float = 4.0) -> tuple[Figure,
     figure = Figure(figsize=(4.6 * columns, height * rows), dpi=110, layout='constrained')
     axes = figure.subplots(rows, columns, squeeze=False)
     return figure, list(axes.ravel())
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG: what `savefig` does, without laying everything out twice."""
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.print_png(path, metadata={'Software': None})
 
 
 def distribution(axes: Axes, sample: Array, **style: Any) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from validation.paper import ITEMS
+from validation.plots import save
 from validation.results import Effort, Results
 
 _INTRODUCTION = """# Validation against the paper
@@ -53,7 +54,7 @@ def write(results: Mapping[str, Results], effort: Effort, command: str, folder: 
     figures.mkdir(parents=True, exist_ok=True)
     for group in groups:
         for stem, figure in group.figures.items():
-            figure.savefig(figures / f'validation-{stem}.png', metadata={'Software': None})
+            save(figure, figures / f'validation-{stem}.png')
     document = {'command': command, 'effort': asdict(effort),
                 'groups': {group.title: group.numbers for group in groups},
                 'settings': {group.title: group.choices for group in groups if group.choices},

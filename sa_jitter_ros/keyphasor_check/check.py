@@ -35,7 +35,8 @@ from sa_jitter_ros.keyphasor_check.lines import (
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses, number_and_patterns
 from sa_jitter_ros.keyphasor_check.result import Checked, KeyphasorCheck, Warn
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, NumberedPulses
-from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
+from sa_jitter_ros.keyphasor_check.vibration import (
+    averages_of, is_steady, path_delay, recovered_jitter, UNCHANGED)
 from sa_jitter_ros.keyphasor_check.wheel import Marking
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
@@ -154,7 +155,8 @@ class _Check:
             'spurious': _counted(fitted.strays, hidden or 'pulses that stand beside every mark'),
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
-            'path_delay': path_delay(averages.get(False, ()), float(ratio.value or 1.0))}
+            'path_delay': UNCHANGED if averages and False not in averages else path_delay(
+                averages.get(False, ()), float(ratio.value or 1.0))}
         concerned = orders.value or NO_ORDERS
         from_marks = by_marks(fitted, float(ratio.value or 1.0), concerned)
         warnings = (*self._warnings, *contradictions(per_revolution, self._machine),
@@ -344,7 +346,11 @@ class _Check:
     def _averaged(self, samples: FloatArray, times: FloatArray, fitted: FittedPulses,
                   ratio: Checked, orders: Sequence[float], clock: Clock
                   ) -> dict[bool, tuple[Average, ...]]:
-        """Return averages with corrected jitter (True), and short ones at their speed (False)."""
+        """
+        Return averages with corrected jitter (True), and short ones at their speed (False).
+
+        The latter tell a delay, which a steady speed does not.
+        """
         measured = measure_jitter(fitted.true, fitted.numbers)
         size = measured.std if measured else fitted.scatter
         expected = max(math.sqrt(12.0) * size, 1.0 / clock.rate if clock.rate else 0.0)
@@ -352,12 +358,15 @@ class _Check:
         kept = times[~np.isin(times, fitted.strays)]
         cycles = {True: int(np.clip(turns // 8, 4, 40)), False: int(np.clip(turns // 24, 1, 20))}
         teeth = fitted.pattern.teeth
-        return {correct: averages_of(
-            samples, self._rate, kept, start_time=self._start, ratio=float(ratio.value or 1.0),
-            orders=orders, pulses_per_revolution=teeth,
-            missing_teeth=teeth - fitted.pattern.present, trigger_cycles=count,
-            keyphasor_rate=1.0 / expected, correct_jitter=correct)
-            for correct, count in cycles.items()}
+        found: dict[bool, tuple[Average, ...]] = {}
+        for correct, count in cycles.items():
+            if correct or not (found[True] and is_steady(fitted.speed)):
+                found[correct] = averages_of(
+                    samples, self._rate, kept, start_time=self._start,
+                    ratio=float(ratio.value or 1.0), orders=orders, pulses_per_revolution=teeth,
+                    missing_teeth=teeth - fitted.pattern.present, trigger_cycles=count,
+                    keyphasor_rate=1.0 / expected, correct_jitter=correct)
+        return found
 
     def _jitter(self, fitted: FittedPulses, averages: Sequence[Average], hidden: str
                 ) -> dict[str, Checked]:

@@ -34,6 +34,9 @@ _FEWEST_SPEEDS = 6
 _SPEED_RANGE = 0.02  # relative, below which phases say nothing of a delay
 _AGREE = 0.01  # p value below which orders disagree
 _CLEAR = 5.0  # amplitude over its noise
+#: the delay that a steady speed tells
+UNCHANGED = Checked(None, None, 's', (), 'the speed hardly changes: record a run-up or several '
+                    'speeds')
 
 
 def averages_of(samples: FloatArray, rate: float, pulses: FloatArray, *, correct_jitter: bool,
@@ -88,8 +91,8 @@ def path_delay(averages: Sequence[Average], ratio: float) -> Checked:
     if len(averages) < _FEWEST_SPEEDS:
         return _unknown('too few averages of the vibration: record longer')
     speeds = np.array([item.trigger_speed for item in averages])
-    if np.ptp(speeds) < _SPEED_RANGE * speeds.mean():
-        return _unknown('the speed hardly changes: record a run-up or several speeds')
+    if is_steady(speeds):
+        return UNCHANGED
     amplitudes = np.array([item.amplitudes for item in averages])
     noise = np.array([item.noise for item in averages])
     size = np.abs(amplitudes)
@@ -120,6 +123,11 @@ def path_delay(averages: Sequence[Average], ratio: float) -> Checked:
         return _unknown('the orders turn differently with the speed, as resonances make them: tap '
                         'the sensor, or compare with a second tach at the vibration input')
     return Checked(mean, error, 's', (), 'phases of the orders turn alike with the speed')
+
+
+def is_steady(speeds: FloatArray) -> bool:
+    """Return whether speeds (n,) in Hz change so little that phases say nothing of a delay."""
+    return bool(np.ptp(speeds) < _SPEED_RANGE * speeds.mean())
 
 
 def _unknown(why: str) -> Checked:

@@ -20,6 +20,7 @@ repeats may also be a ripple of the speed with the revolution.
 
 from dataclasses import dataclass
 from itertools import pairwise
+import math
 
 import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
@@ -83,8 +84,9 @@ def patterns(pulses: NumberedPulses) -> list[Marking]:
     numbers, places = pulses.numbers[part], pulses.places[part]
     span = int(numbers[-1] - numbers[0]) + 1
     most = min(_MOST_TEETH, span // _FEWEST_REVOLUTIONS)
-    even = _evidence(numbers, places, 1)
-    gains = np.array([_evidence(numbers, places, n) - even for n in range(2, most + 1)])
+    evidence = _Evidence(numbers, places)
+    even = evidence.of(1)
+    gains = np.array([evidence.of(n) - even for n in range(2, most + 1)])
     found: list[Marking] = []
     for index in np.argsort(-gains):
         teeth, gain = int(index) + 2, float(gains[index])
@@ -149,6 +151,8 @@ def _seen_of(numbers: IntArray, teeth: int) -> tuple[IntArray, IntArray]:
 
 def _missing(seen: IntArray, span: IntArray) -> BoolArray:
     share = seen / np.maximum(span, 1)
+    if share.min() >= _MISSING * share.max():
+        return np.zeros(seen.size, np.bool_)
     usual = float(np.quantile(share, 0.75))
     missing = share < _MISSING * usual
     if usual < 1.0 - _LOST or np.mean(missing) > _MOSTLY:
@@ -156,27 +160,40 @@ def _missing(seen: IntArray, span: IntArray) -> BoolArray:
     return np.asarray(missing)
 
 
-def _evidence(numbers: IntArray, places: FloatArray, teeth: int) -> float:
-    """Return the log likelihood of a target of so many teeth, less half a log n a parameter."""
-    classes = numbers % teeth
-    seen, span = _seen_of(numbers, teeth)
-    missing = _missing(seen, span)
-    lost = float((span - seen)[~missing].sum())
-    positions = float(span[~missing].sum())
-    share = min(max(lost / positions, 0.5 / positions), 0.5)
-    absent = (span - seen)[missing]
-    occupancy = (lost * np.log(share) + (positions - lost) * np.log1p(-share)
-                 + float(absent.sum()) * np.log(_ALWAYS)
-                 + float(seen[missing].sum()) * np.log(1.0 - _ALWAYS))
-    kept = ~missing[classes]
-    own, place = classes[kept], places[kept]
-    mean = np.bincount(own, place, teeth) / np.maximum(np.bincount(own, minlength=teeth), 1)
-    left = np.abs(place - mean[own])
-    # Least absolute deviations: strays that pass for pulses say little.
-    count = int(np.count_nonzero(kept))
-    even, uneven = (-_TEMPER * count * np.log(max(float(each.mean()), 1e-9))
-                    for each in (np.abs(place - np.median(place)), left))
-    # Gaps need not have uneven teeth between them.
-    penalty = 0.5 * np.log(count)
-    return float(_TEMPER * occupancy - 2.0 * penalty * np.count_nonzero(missing)
-                 + max(even, uneven - penalty * (np.count_nonzero(~missing) - 1)))
+class _Evidence:
+    """What pulses with these numbers, at these places (n,) in teeth, say for numbers of teeth."""
+
+    def __init__(self, numbers: IntArray, places: FloatArray) -> None:
+        self._numbers, self._places = numbers, places
+        self._even = _scatter(places - np.median(places))
+
+    def of(self, teeth: int) -> float:
+        """Return the log likelihood of a target of so many teeth, less half a log n a value."""
+        classes = self._numbers % teeth
+        seen, span = _seen_of(self._numbers, teeth)
+        missing = _missing(seen, span)
+        gaps, place, even = int(np.count_nonzero(missing)), self._places, self._even
+        absent = unexpected = 0
+        if gaps:
+            absent, unexpected = int((span - seen)[missing].sum()), int(seen[missing].sum())
+            kept = ~missing[classes]
+            classes, place = classes[kept], place[kept]
+            even = _scatter(place - np.median(place))
+        count = place.size
+        lost = float(int(span.sum()) - self._numbers.size - absent)
+        positions = lost + count
+        share = min(max(lost / positions, 0.5 / positions), 0.5)
+        occupancy = (lost * math.log(share) + count * math.log1p(-share)
+                     + absent * math.log(_ALWAYS) + unexpected * math.log(1.0 - _ALWAYS))
+        mean = np.bincount(classes, place, teeth) / np.maximum(seen, 1)
+        # Least absolute deviations: strays that pass for pulses say little.
+        uneven = _scatter(place - mean[classes])
+        # Gaps need not have uneven teeth between them.
+        penalty = 0.5 * math.log(count)
+        return _TEMPER * occupancy - 2.0 * penalty * gaps + max(
+            -_TEMPER * count * even, -_TEMPER * count * uneven - penalty * (teeth - gaps - 1))
+
+
+def _scatter(away: FloatArray) -> float:
+    """Return the logarithm of the mean distance of pulses (n,) from their places, in teeth."""
+    return math.log(max(float(np.abs(away).mean()), 1e-9))

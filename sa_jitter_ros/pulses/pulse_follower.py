@@ -212,7 +212,7 @@ class PulseFollower:
         if self._is_of_clock():
             return True
         steps, widths, _ = self._lock.lists
-        given = np.maximum(self._lock.believed, self._options.tolerance).tolist()
+        given = [max(item, self._options.tolerance) for item in self._lock.lists[2]]
         rules = PathRules(
             steps, widths, model.scatter, given, self._options.maximum_missing, model.expected,
             model.predictions, model.tick, model.degrees)
@@ -230,16 +230,17 @@ class PulseFollower:
 
     def _is_of_clock(self) -> bool:
         """Whether the ticks of a clock explain the next two intervals, which are regular then."""
-        pulses = np.array([self.confirmed, *self._queue[:2]])
-        gaps, widths, slot = np.diff(pulses), [], self.slot
-        for gap in gaps.tolist():
-            passed = self._slots_in(gap, self._model.expected, slot)
+        model, (_, every, _) = self._model, self._lock.lists
+        size, slot, last, expected = len(every), self.slot, self.confirmed, model.expected
+        gaps, widths = [], []
+        for pulse in () if model.given else self._queue[:2]:
+            passed = self._slots_in(pulse - last, expected, slot)
             if not 0 < passed <= 1 + self._options.maximum_missing:
                 return False
-            slots = (slot + np.arange(passed)) % self._lock.steps.size
-            widths.append(float(self._lock.widths[slots].sum()))
-            slot = (slot + passed) % self._lock.steps.size
-        return self._model.explains(gaps, np.array(widths), float(pulses[-1]))
+            gaps.append(pulse - last)
+            widths.append(sum(every[(slot + number) % size] for number in range(passed)))
+            slot, last = (slot + passed) % size, pulse
+        return bool(gaps) and model.explains(np.array(gaps), np.array(widths), last)
 
     def _commit(self, paths: list[Path], final: bool) -> bool:
         """Decide about the first pulses if the likely paths agree about them."""
@@ -407,16 +408,18 @@ class PulseFollower:
 
     def _slots_in(self, gap: float, level: float, slot: int) -> int:
         """Return how many slots a gap (s) from `slot` on has at a level, 0 if no whole one."""
-        widths = np.roll(self._lock.widths, -slot)
-        revolution = float(widths.sum())
-        turns, rest = divmod(gap / math.exp(level), revolution)
+        _, widths, _ = self._lock.lists
+        turns, rest = divmod(gap / math.exp(level), sum(widths))
         if not turns <= _LONGEST_GAP:  # nor NaN
             return 0
-        ends = np.append(0.0, np.cumsum(widths))
-        nearest = int(np.argmin(np.abs(ends - rest)))
-        if abs(float(ends[nearest]) - rest) > NEAR_WHOLE:
-            return 0
-        return int(turns) * widths.size + nearest
+        end, nearest, apart = 0.0, 0, rest
+        for number in range(1, len(widths) + 1):
+            end += widths[(slot + number - 1) % len(widths)]
+            if abs(end - rest) < apart:
+                nearest, apart = number, abs(end - rest)
+            if end > rest:
+                break
+        return int(turns) * len(widths) + nearest if apart <= NEAR_WHOLE else 0
 
     @property
     def _room_of_marks(self) -> int:

@@ -18,10 +18,11 @@ are extended pulse by pulse, the unlikely ones are dropped. What all likely path
 decided.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 import math
+from math import log1p
 from operator import itemgetter, mul
 from typing import NamedTuple
 
@@ -75,6 +76,7 @@ class Step(NamedTuple):
 
 
 _STRAY = Step(0)
+_Prediction = tuple[float, bool, float, int]  # cost, whether it slopes, level, and its number
 
 
 class Path(NamedTuple):
@@ -131,12 +133,18 @@ class PathRules:
     def extend(self, paths: list[Path], pulse: float, limit: float = math.inf) -> list[Path]:
         """Return the paths with one more pulse that cost up to `limit`, the most likely first."""
         found: list[Path] = []
+        predicted: dict[tuple[tuple[float, ...], int], list[_Prediction]] = {}
         for path in paths:
             if path.cost + self.stray <= limit:
-                found.append(path._replace(
-                    cost=path.cost + self.stray, steps=(*path.steps, _STRAY), stray_at=pulse))
+                _, last, slot, passed, recent, using, jumped, steps, _ = path
+                found.append(Path(path.cost + self.stray, last, slot, passed, recent, using,
+                                  jumped, (*steps, _STRAY), pulse))
             if pulse > path.last and path.cost + self.each <= limit:
-                found += self._true(path, pulse, limit)
+                # Paths that differ in strays only expect the same.
+                known = path.recent, path.using
+                if known not in predicted:
+                    predicted[known] = self._expected(*known)
+                found += self._true(path, pulse, limit, predicted[known])
             if found:  # a path that costs more than those that are kept is not looked at
                 found.sort(key=itemgetter(0))
                 del found[self.most:]
@@ -144,13 +152,14 @@ class PathRules:
                             found[-1].cost if len(found) == self.most else limit)
         return [path for path in found if path.cost <= limit]
 
-    def _true(self, path: Path, pulse: float, limit: float) -> Iterator[Path]:
-        """Yield paths on which the next pulse (s) is true: those that cost up to `limit`."""
-        gap = pulse - path.last
-        expected = list(self._expected(path))
-        width, passed, slot = 0.0, path.passed, path.slot
+    def _true(self, path: Path, pulse: float, limit: float, expected: list[_Prediction]
+              ) -> list[Path]:
+        """Return paths on which the next pulse (s) is true: those that cost up to `limit`."""
+        before, last, slot, passed, recent, chosen, jumped, steps, stray_at = path
+        gap, width = pulse - last, 0.0
+        found = []
         for mark in range(1, 2 + self.maximum_missing):
-            if mark > 1 and path.cost + MISSING + MORE_MISSING * (mark - 2) + self.each > limit:
+            if mark > 1 and before + MISSING + MORE_MISSING * (mark - 2) + self.each > limit:
                 break
             width += self.widths[slot]
             passed += self.steps[slot]
@@ -160,21 +169,21 @@ class PathRules:
             jumps = cost == JUMP
             if mark > 1 and not jumps:
                 cost += MISSING + MORE_MISSING * (mark - 2) + self._by_chance(path, gap / width)
-            if (mark == 1 or not jumps) and path.cost + cost + self.each <= limit:
-                true = path._replace(
-                    cost=path.cost + cost + self.each, last=pulse, slot=slot, passed=passed,
-                    steps=(*path.steps, Step(mark, level, off, jumps)))
+            total = before + cost + self.each
+            if (mark == 1 or not jumps) and total <= limit:
+                taken = (*steps, Step(mark, level, off, jumps))
                 if jumps:  # of the angle, and the speed stays as it was; or of the speed
-                    yield true
-                    true = true._replace(
-                        cost=true.cost + (FRACTION if is_multiple(off) else 0.0), jumped=True,
-                        recent=(*path.recent[-1:], level))
+                    found += [
+                        Path(total, pulse, slot, passed, recent, chosen, jumped, taken, stray_at),
+                        Path(total + (FRACTION if is_multiple(off) else 0.0), pulse, slot, passed,
+                             (*recent[-1:], level), chosen, True, taken, stray_at)]
                 else:
-                    true = true._replace(
-                        recent=(*path.recent, *(level,) * mark)[-REACH:], using=using)
-                yield true
+                    found.append(Path(total, pulse, slot, passed,
+                                      (*recent, *(level,) * mark)[-REACH:], using, jumped, taken,
+                                      stray_at))
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
+        return found
 
     def _by_chance(self, path: Path, interval: float) -> float:
         """
@@ -187,21 +196,22 @@ class PathRules:
         off = (path.stray_at - path.last) / interval
         return max(-math.log(2.0 * max(abs(off - max(round(off), 1)), _NEAREST)), 0.0)
 
-    def _expected(self, path: Path) -> Iterator[tuple[float, bool, float, int]]:
-        """Yield cost, whether it slopes, expected level and number of the predictions."""
-        recent = path.recent
+    def _expected(self, recent: tuple[float, ...], using: int) -> list[_Prediction]:
+        """Return cost, whether it slopes, expected level and number of the predictions."""
+        found, slows = [], _slows(recent)
         for number, (cost, slopes, weights) in enumerate(self.predictions):
             size = len(weights)
             if size > len(recent):
                 continue
-            cost = 0.0 if number == path.using else cost
-            yield cost, slopes, sum(map(mul, weights, recent[-size:])), number
-            if size == 2 and _slows(recent):
-                for level in slowing(recent[-1], recent[-2]):
-                    yield cost, slopes, level, number
+            cost = 0.0 if number == using else cost
+            found.append((cost, slopes, sum(map(mul, weights, recent[-size:])), number))
+            if size == 2 and slows:
+                found += [(cost, slopes, level, number)
+                          for level in slowing(recent[-1], recent[-2])]
+        return found
 
-    def _deviation(self, path: Path, expected: list[tuple[float, bool, float, int]], level: float,
-                   mark: int) -> tuple[float, float, int]:
+    def _deviation(self, path: Path, expected: list[_Prediction], level: float, mark: int
+                   ) -> tuple[float, float, int]:
         """
         Return how unlikely a level is, its deviation from what is expected, and by which number.
 
@@ -210,12 +220,16 @@ class PathRules:
         """
         best, off, using = math.inf, 0.0, path.using
         half, tick = 0.5 * (mark - 1), self.tick / mark
+        scatter, degrees = self.scatter, self.degrees
         for cost, slopes, each, number in expected:
+            if cost >= best:
+                continue
             apart = level - each
             if slopes and mark > 1:
                 apart = min(apart, apart - half * (each - path.recent[-1]), key=abs)
-            beyond = max(abs(apart) - tick, 0.0) / self.scatter
-            cost += 0.5 * (self.degrees + 1.0) * math.log1p(beyond * beyond / self.degrees)
+            beyond = max(abs(apart) - tick, 0.0) / scatter
+            if beyond:  # or NaN
+                cost += 0.5 * (degrees + 1.0) * log1p(beyond * beyond / degrees)
             if cost < best:
                 best, off, using = cost, apart, number
         off = math.expm1(off)
