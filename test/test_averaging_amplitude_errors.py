@@ -116,6 +116,7 @@ def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
     assert hold(shares(absent / along[:, ABSENT]), trials).all()
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('count', 'turn', 'weak'), [(20, 0.3, 0.1), (40, 0.8, 0.03)])
 def test_errors_of_a_sideband_hold_what_jitter_leaks_into_the_mean(count, turn, weak):
     """Into single cycles the strong order leaks much more, which the next cycle takes back."""

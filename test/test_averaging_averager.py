@@ -68,6 +68,7 @@ def same(first, second):
 WHOLE = {}
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('options', [
     {}, {'trigger_cycles': 9}, {'trigger_cycles': 9, 'averaging': 'sliding'},
     {'angle_law': 'spline', 'ratio': 2.4}, {'correct_jitter': True, 'keyphasor_rate': 1e3}],

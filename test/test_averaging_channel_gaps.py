@@ -43,6 +43,7 @@ def averages_of(vibration, pulses, cut=6400, **options):
     return found + averager.flush(), averager
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('value', [np.nan, np.inf, 0.0, 3.3])
 def test_a_channel_that_tells_nothing_changes_no_other_one(machine, value):
     vibration, pulses = machine
@@ -89,6 +90,7 @@ def test_averages_whose_correction_was_refused_have_a_history_of_indicators_of_t
             np.testing.assert_array_equal(both.values, own.values)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('averaging', ['block', 'sliding', 'exponential'])
 def test_a_gap_of_one_channel_costs_its_averages_only(machine, averaging):
     vibration, pulses = machine

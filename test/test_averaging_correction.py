@@ -46,6 +46,7 @@ def gearbox(ratio, noise, harmonics=(1.0, 0.5), seed=5):
         effects=(DeclaredJitter('uniform', 1.0 / np.sqrt(12.0) / CLOCK), AdditiveNoise(noise)))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('ratio', [1.0, 2.0, 2.40789])
 @pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
 def test_amplitudes_come_back_and_errors_are_found(ratio, law):

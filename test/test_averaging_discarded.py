@@ -28,6 +28,7 @@ def machine(seconds, *, ratio=1.0, noise=0.0, rng=None):
     return wave + (noise * rng.standard_normal(times.size) if noise else 0.0)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('averaging', ['block', 'sliding', 'exponential'])
 @pytest.mark.parametrize('ratio', [1.0, 2.40789])
 def test_an_average_goes_on_over_missing_pulses(averaging, ratio):
@@ -82,6 +83,7 @@ def test_an_average_with_too_many_discarded_cycles_begins_later():
     np.testing.assert_array_equal(averages[0].cycle_numbers[:2], [0, 3])
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('correct', [False, True])
 @pytest.mark.parametrize('seed', range(3))
 def test_averages_that_begin_later_do_not_depend_on_the_cutting(seed, correct):
@@ -150,6 +152,7 @@ def test_pulse_errors_are_recovered_over_gaps(rng, ratio):
     assert np.std(np.concatenate(z_scores)) == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('seed', range(4))
 def test_any_cutting_gives_the_same_averages(seed):
     rng = np.random.default_rng(seed)

@@ -43,6 +43,7 @@ def averaged(depth, order, *, cycles=30, averages=4, channels=12, seed=0, jitter
         trigger_cycles=cycles, orders=[19.0, 38.0], **options)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('order', 'depth', 'cycles'), [
     (4.9, 0.8, 30), (5.0, 0.8, 30), (11.3, 0.5, 30), (0.41, 0.8, 30), (4.9, 0.8, 8)])
 def test_envelope_has_the_amplitude_of_the_modulation(order, depth, cycles):

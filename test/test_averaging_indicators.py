@@ -326,6 +326,7 @@ class TestOffset:
 
 class TestStandardErrors:
 
+    @pytest.mark.machines
     @pytest.mark.parametrize(('noise', 'damage'), [
         (0.1, 0.0), (1.0, 0.0), (0.1, 0.5), (0.02, 0.5)])
     def test_they_hold(self, rng, noise, damage):

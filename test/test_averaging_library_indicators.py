@@ -107,6 +107,7 @@ def test_they_are_those_of_the_corrected_average_as_the_topic_has_them():
         assert item.envelope is item.correction.envelope is not None
 
 
+@pytest.mark.machines
 def test_the_machine_gives_ratio_and_orders_of_a_shaft():
     vibration, pulses = rig()
     by_name, = sa.average(vibration, RATE, pulses, machine=MACHINE, shaft='input')

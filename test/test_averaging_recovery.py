@@ -137,6 +137,7 @@ def test_gear_mesh_is_restored_at_the_widths_that_hide_it(rng, width, snr_db):
     assert after < 0.06 * np.std(errors)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('ratio', 'width', 'noise', 'lines'), [
     (RATIO, 0.4, 0.2, MESH),
     (RATIO, 0.8, 1.0, MESH),
@@ -183,6 +184,7 @@ def test_phase_is_that_at_angle_zero(rng):
     assert np.angle(found.amplitudes[0, 0]) == pytest.approx(phase, abs=0.01)
 
 
+@pytest.mark.machines
 def test_noise_and_nothing_else_is_refused(rng):
     accepted = 0
     for _ in range(100):
@@ -204,6 +206,7 @@ def test_a_line_that_is_not_synchronous_is_not_taken(rng, order):
     assert not recover(cycles, pulses, declared=declared(0.2)).accepted
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('quality', 'most'), [(50, 0), (500, 8)])
 def test_noise_that_rings_at_an_order_is_mostly_refused(quality, most):
     # Cycles that ring on are not independent: at 500, taking them for it lets a third of 40 pass.

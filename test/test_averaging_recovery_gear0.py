@@ -45,6 +45,7 @@ def average(cycles):
     return cycles.mean(axis=0).T @ waves
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('clock', [2560.0, 8000.0])
 @pytest.mark.parametrize('count', [40, 100])
 def test_corrected_amplitudes_are_those_of_the_reference(gearbox, clock, count):

@@ -85,6 +85,7 @@ def assert_same(found, expected):
                     rtol=1e-9, atol=1e-11, err_msg=f'{name} {key}')
 
 
+@pytest.mark.machines
 @settings(max_examples=6)
 @given(st.data())
 def test_averages_are_the_same_for_every_cut_and_order_of_arrival(data):
@@ -393,6 +394,7 @@ def test_spline_law_follows_a_smooth_speed_best():
 # --- noise ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('ratio', 'jitter'), [(1.0, 0.0), (2.40789, 0.0), (1.0, 0.04)])
 def test_noise_estimate_is_the_scatter_along_the_radius(ratio, jitter, rng):
     rate, speed, cycles, averages = 3200.0 * np.ceil(ratio), 50.0, 24, 100

@@ -41,6 +41,7 @@ def averaged(vibration, pulses, **options):
         str(item.message) for item in said if 'inside revolutions' in str(item.message)]
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('seed', range(12))
 def test_what_a_revolution_loses_is_said_with_its_size(seed):
     rng = np.random.default_rng(seed)

@@ -59,6 +59,7 @@ def written(recording):
     return folder
 
 
+@pytest.mark.machines
 def test_json_has_every_key_with_value_error_and_alternatives(written):
     report = json.loads((written / 'keyphasor.json').read_text())
     assert report.keys() == {*KEYS, 'warnings'}

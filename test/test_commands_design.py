@@ -166,6 +166,7 @@ def test_bad_input_is_one_line_and_status_2(capsys, arguments, message):
     assert error.startswith('design: ')
 
 
+@pytest.mark.machines
 def test_it_runs_as_a_process_and_explains_units(tmp_path):
     result = subprocess.run(
         [sys.executable, '-m', 'sa_jitter_ros.commands.design', '--help'], cwd=tmp_path,

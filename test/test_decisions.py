@@ -161,6 +161,7 @@ def test_marks_count_from_any_of_them(rng):
     assert distance('cubic', None, 'linear') == math.inf
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('marks', [2, 4])
 def test_marks_are_as_far_off_as_their_errors_say(rng, marks):
     """Angles count from their mean, whose error theirs have in common."""
@@ -225,6 +226,7 @@ def test_every_damage_is_a_class():
     assert DAMAGES.keys() == DAMAGED.keys()
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', ['correct 0', 'damaged faster 0'])
 def test_a_row_is_the_same_whenever_it_is_drawn(name):
     row, = (item for item in rows() if item.name == name)

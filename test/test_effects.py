@@ -160,6 +160,7 @@ def test_correlated_jitter_is_autoregressive(rng, correlation):
     check(predict(MODEL, [effect]), average_of(errors + slow))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('correlation', 'cycles', 'std'), [
     (0.99, 40, 5e-5), (0.9, 10, 5e-5), (0.5, 1, 5e-5), (-0.9, 40, 5e-5), (-0.9, 40, 3e-5)])
 def test_cycles_that_remember_each_other_count_as_fewer(rng, correlation, cycles, std):
@@ -373,6 +374,7 @@ def test_geometry_has_the_distribution_of_drawn_averages(rng, angles, cycles):
         assert kstest(drawn[:, i], lambda x, i=i: prediction.cdf(x)[i]).statistic < 0.025
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', ['target_geometry', 'clock_skew', 'missing_pulses',
                                   'keyphasor_quantisation'])
 @pytest.mark.parametrize('cycles', [10_000, 100_000])

@@ -69,6 +69,7 @@ def test_raw_amplitudes_are_those_of_the_averager(law):
         assert item.raw == pytest.approx(average.amplitudes, abs=1e-4)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('law', LAWS)
 def test_added_jitter_attenuates_as_predicted_for_the_law(law):
     model = replace(MODEL, angle_law=law)
@@ -111,6 +112,7 @@ def saved(folder, *recordings):
             str(folder / 'out'), '--quiet']
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('clock', 'grid'), [(1470.0, 'a grid of 1470 Hz'),
                                              (2e6, 'no coarse grid')])
 def test_recordings_by_different_clocks_are_refused(tmp_path, capsys, clock, grid):

@@ -172,6 +172,7 @@ def quantised(rng):
                      pulse_times=np.ceil(true * clock) / clock), model
 
 
+@pytest.mark.machines
 def test_what_ticks_hide_of_the_motion_is_no_other_effect(quantised):
     """One channel: nothing predicts the motion within the ticks, and so nobody is to blame."""
     recording, model = quantised
@@ -204,6 +205,7 @@ def test_loop_is_repeatable(quantised):
     assert np.isfinite(first).all()
 
 
+@pytest.mark.machines
 def test_effect_that_leaves_nearly_all_is_not_named(rng):
     """A scatter far beyond all noise is not blamed on a little more noise."""
     seconds = 12 * CYCLES / SPEED + 0.2

@@ -136,6 +136,7 @@ def test_a_gain_scatters_amplitudes_and_not_what_pulse_errors_cost(std, rng):
         assert found.amplitude_variance[0, line] == pytest.approx(raw.var(), rel=0.08)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('wander', [False, True])
 @pytest.mark.parametrize(('cycles', 'bias', 'off'), [(5, 0.04, 5e-3), (40, 0.01, 1e-3)])
 def test_known_pulses_give_the_distribution_of_their_own_average(cycles, bias, off, wander, rng):

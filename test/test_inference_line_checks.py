@@ -22,6 +22,7 @@ from sa_jitter_ros.recordings.recording import ArraySource, Recording
 RATE, SPEED, CYCLES, ACQUISITIONS = 5000.0, 16.0, 8, 80
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('turn', [0.0, 0.15])
 def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn):
     """A speed that changes by 2 % bends the angle, so that order 58 leaks into order 59."""
@@ -69,6 +70,7 @@ def turning_order(rng, share):
     return check_lines(observation, choose_lines(observation), np.zeros(3))[1]
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('share', [0.2, 1.0])
 def test_order_that_turns_by_itself_from_cycle_to_cycle_is_no_common_motion(rng, share):
     """On some machines pulse errors take its turn for theirs, and sidebands make up for it."""
@@ -110,6 +112,7 @@ def test_gain_of_one_channel_is_none_of_all(rng, drifting):
     assert not drifting or 'channel 1' in found.text
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('noise', [1.0, 4.0])
 @pytest.mark.parametrize('seed', range(3))
 def test_amplitudes_that_share_the_noise_of_the_errors_follow_nothing(noise, seed):

@@ -158,6 +158,7 @@ def test_moving_source_takes_from_the_average_with_a_reference_keyphasor_too():
     assert abs(each.mean()) < 3.0 * each.std(ddof=1) / np.sqrt(each.size) < loss[:, highest].mean()
 
 
+@pytest.mark.machines
 def test_declared_model_suffices():
     found = traced()
     content = report(found)
@@ -309,6 +310,7 @@ def test_steady_torsion_that_averages_lose_by_is_unexplained():
     assert row.upper > 0.05 * (2.0 * np.pi * order * SPEED) ** 2 / np.sqrt(2.0)
 
 
+@pytest.mark.machines
 def test_declared_effect_is_not_missing():
     found = traced(*make_effects({'clock_skew': {'skew': 4e-4}}),
                    declared=[make_effect('clock_skew', skew=4e-4)])

@@ -282,6 +282,7 @@ def test_too_few_trigger_cycles_are_named(cycles):
         traced(simulated(acquisitions=2), replace(MODEL, trigger_cycles=cycles))
 
 
+@pytest.mark.machines
 def test_order_that_is_not_compared_is_named():
     content = report(traced(simulated(), replace(MODEL, orders=(8.0, 13.0, 16.0))))
     assert {item['order'] for item in content['lines']} == {8.0, 16.0}

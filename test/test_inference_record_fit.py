@@ -222,6 +222,7 @@ def foreign_shaft(rng, *, varying):
     return samples, rate, times, errors, sides
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('varying', [0.0, 1.5e-3])
 def test_a_foreign_shaft_hides_no_lines_and_tells_no_errors(rng, varying):
     """What is left beside its strong lines must not end the search for others."""
@@ -298,6 +299,7 @@ def test_a_tone_near_an_order_is_one_tone_of_the_right_numbers(rng, swing):
     assert amplitude == pytest.approx([0.3], abs=4.0 * error)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('seed', [0, 3, 4])
 def test_a_strong_tone_of_the_supply_leads_no_error_astray(seed):
     """It beats the shaft slowly, and the sidebands that a converter makes are as far from it."""
@@ -368,6 +370,7 @@ def test_a_speed_that_swings_as_one_wave_makes_bends_and_no_sidebands(rng, wave)
     assert np.std(off) < 0.3 * np.std(bends)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('seed', range(6))
 def test_sidebands_are_no_pulse_errors_that_swing(seed):
     """Errors that swing as fast, or at an alias, make lines at the same places, and others."""

@@ -90,6 +90,7 @@ def test_a_source_that_moves_does_not_hide_the_undeclared_orders(rng):
     assert found.undeclared[0].size >= 3
 
 
+@pytest.mark.machines
 def test_sidebands_of_a_shaft_are_no_tones_on_a_steady_machine(rng):
     gears = {8.0: 1.0, 16.0: 0.7}
     beside = {7.63: 0.2, 8.37: -0.1, 15.63: -0.15, 16.37: 0.05}  # in phase with neither line

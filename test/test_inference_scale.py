@@ -65,10 +65,12 @@ def drifting(observation, size, rng):
     return replace(observation, acquisitions=tuple(map(changed, observation.acquisitions)))
 
 
+@pytest.mark.machines
 def test_steady_machine_has_no_unsteadiness(recording, observation):
     assert trace([observation], [recording]).unsteadiness == 0.0
 
 
+@pytest.mark.machines
 def test_small_unexplained_scatter_is_unsteadiness(recording, observation, rng):
     size = 0.012
     found = trace([drifting(observation, size, rng)], [recording])
@@ -94,6 +96,7 @@ def test_levels_of_few_averages_are_part_of_the_scale(recording, observation, rn
     assert error < 0.05  # a quarter of it is that of the levels
 
 
+@pytest.mark.machines
 def test_large_unexplained_scatter_stays_unexplained(recording, observation, rng):
     found = trace([drifting(observation, 0.08, rng)], [recording])
     assert found.verdict == 'unexplained'
@@ -102,6 +105,7 @@ def test_large_unexplained_scatter_stays_unexplained(recording, observation, rng
     assert found.after.chi2_per_dof > 5.0
 
 
+@pytest.mark.machines
 def test_little_white_noise_is_named_although_the_machine_scatters_as_much():
     noisy = simulated(noise=0.3)
     found = trace([observe(noisy, MODEL)], [noisy])

@@ -72,6 +72,7 @@ def test_effect_is_found_with_its_size(name):
     assert np.sqrt(np.mean(np.square(off))) < 2.0
 
 
+@pytest.mark.machines
 def test_parameters_that_fit_more_pulses_are_surer():
     first, second = machine(3, skew=2e-5), machine(4, skew=2e-5)
     timing = read_timing([first])
@@ -232,6 +233,7 @@ def test_declared_bandwidth_that_is_too_small_is_another_number():
     assert abs(bandwidth - 0.3) < 4.0 * error
 
 
+@pytest.mark.machines
 def test_declared_speed_fluctuation_that_is_not_there_has_size_0():
     declared = EFFECTS['speed_fluctuation'].of_ripple(2.0 * UNIT, MODEL)
     for seed in range(2):
@@ -465,6 +467,7 @@ def test_missing_pulses_have_no_error():
     assert names_of(read_timing([replace(part, measured=measured, errors=errors)])) == set()
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('lost', [2, 6])
 def test_skew_beside_missing_pulses_is_no_jitter(lost):
     """A missing pulse has the mean error, as it has in what a skew makes."""
@@ -604,6 +607,7 @@ def test_skew_of_a_machine_whose_speed_changes_is_no_wander():
         assert abs(value - 2e-4) < 3.0 * error
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('beside', [0.0, 3.0])
 def test_speed_fluctuation_is_told_from_sidebands_by_its_frequency(beside):
     """The shaft bends the angle slowly; sidebands of half an order bend it to and fro."""

@@ -87,6 +87,7 @@ def values(check, *names):
 
 # --- targets ------------------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'missing', 'late', 'drift'), [
     (1, (), None, 0.01), (1, (), None, 2.0), (2, (), (0.01, -0.01), 0.01),
     (2, (), (0.3, -0.3), 0.01), (8, (), 3e-3, 2.0),
@@ -128,6 +129,7 @@ def test_marks_have_their_places_and_errors(rng):
     assert 0.7 < size < 1.4  # 120 values, of which those of a target sum to 0
 
 
+@pytest.mark.machines
 def test_even_marks_have_no_pattern(rng):
     """Of 40 even targets at most one looks uneven."""
     found = [len(patterns(number_pulses(tach(rng, int(marks))[0])))
@@ -135,6 +137,7 @@ def test_even_marks_have_no_pattern(rng):
     assert np.count_nonzero(found) <= 1
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'orders'), [
     (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS)])
 def test_lines_of_the_vibration_tell_even_marks(rng, marks, orders):
@@ -155,6 +158,7 @@ def test_even_marks_without_vibration_are_listed_with_what_would_decide(rng):
     assert {'marks_ambiguous', 'no_orders'} <= codes(check)
 
 
+@pytest.mark.machines
 def test_stated_marks_count_unless_pulses_contradict(rng):
     times = tach(rng, 8)[0]
     check = checked(vibration(rng, orders=((16.0, 1.0),)), times, pulses_per_revolution=8)
@@ -206,6 +210,7 @@ def test_no_clock_in_pulses_of_full_precision(rng):
                    for marks in (1, 8) for drift in (0.0, 0.5) for _ in range(5))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('memory', [0.0, 0.6, -0.4])
 def test_jitter_of_pulses_has_its_size_memory_and_errors(rng, memory):
     """At the speed of `motion`, over 30 drawn tachs: the errors are those of the scatter."""
@@ -321,6 +326,7 @@ def test_a_wheel_with_a_fifth_lost_and_as_many_strays_is_one(rng, marks, missing
     assert checked(samples, np.sort(np.append(pulses, strays))).findings
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('factor', 'wrong'), [(0.5, 2), (2.0, 1)])
 def test_another_sampling_rate_that_fits_the_spans_is_listed(rng, factor, wrong):
     check = checked(vibration(rng), tach(rng)[0], rate=factor * RATE)
@@ -338,6 +344,7 @@ def test_another_sampling_rate_that_fits_the_spans_is_listed(rng, factor, wrong)
 
 # --- delay --------------------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize('delay', [0.0, 2e-4])
 def test_delay_of_the_tach_turns_all_orders_alike(rng, delay):
     times = tach(rng, drift=1.0)[0] + delay
@@ -356,6 +363,7 @@ def test_delay_has_the_error_that_is_stated(rng):
     assert np.sqrt(np.mean(np.square(known))) < 1.8
 
 
+@pytest.mark.machines
 def test_delay_that_was_found_keeps_the_phases_of_a_run_up(rng):
     """Without it order 38 turns by more than a radian, with it by less than a tenth."""
     times = tach(rng, drift=1.0)[0] + 2e-4
@@ -369,6 +377,7 @@ def test_delay_that_was_found_keeps_the_phases_of_a_run_up(rng):
     assert turned[1] < 0.1
 
 
+@pytest.mark.machines
 def test_delay_is_not_given_where_orders_disagree(rng):
     time, angle = motion(1.0)
     turns = np.interp(np.arange(int(SECONDS * RATE)) / RATE, time, angle)
@@ -385,6 +394,7 @@ def test_delay_is_not_given_where_orders_disagree(rng):
 
 # --- measured -----------------------------------------------------------------------------------
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'missing'), [('4b11_running', 3), ('toyota_3_tooth_cam', 2)])
 def test_measured_engines(shared_data, name, missing):
     """Wheels 36-2-1 and 36-2; sensors shift the teeth in front of a gap."""

@@ -45,6 +45,7 @@ def pulses_on(rng, edges, *, turns=60, share=0.0, ramp=0.2, jitter=2e-5):
     return np.sort(np.append(kept, rng.uniform(times[0], times[-1], round(share * times.size))))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('share', [0.0, 0.01])
 @pytest.mark.parametrize('marks', [4, 12, 24, 60])
 def test_an_extra_mark_is_a_mark(rng, marks, share):
@@ -80,6 +81,7 @@ def test_teeth_that_one_half_of_a_recording_never_shows_are_missing_there(rng):
     assert check.findings['pulses_per_revolution'].value == 3
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('teeth', 'missing'), [(60, 2), (36, 1)])
 def test_missing_teeth_stay_missing_teeth_among_many_strays(rng, teeth, missing):
     edges = np.arange(teeth - missing) / teeth
@@ -94,6 +96,7 @@ def test_even_marks_among_many_strays_have_no_pattern(rng):
         assert not found
 
 
+@pytest.mark.machines
 def test_what_is_found_is_averaged_without_loss(rng):
     """Orders come back, and no pulse of the extra mark is taken for a double."""
     edges, rate = with_extra(12, 0.34), 6000.0
@@ -136,6 +139,7 @@ def test_library_takes_the_target_of_the_machine_file(files):
     assert (found.verdict, found.found) == ('none', ())
 
 
+@pytest.mark.machines
 def test_player_takes_the_target_of_the_machine_file(files, ros_graph):
     path, params = files
     alone, with_file = (ros_graph.add(RecordingPlayer, cli_args=[

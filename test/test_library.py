@@ -41,6 +41,7 @@ def test_the_import_loads_less_than_that_of_numpy():
     assert not {name.partition('.')[0] for name in package} & set(SLOW)
 
 
+@pytest.mark.machines
 def test_every_public_name_works_without_ros_and_matplotlib():
     names = in_new_process(
         'import json, sa_jitter_ros as sa\n'

@@ -66,6 +66,7 @@ def test_every_way_to_name_recording_and_model_finds_the_same(recording, found, 
         assert loop_found.verdict == loop_found.report['verdict'] == 'traced'
 
 
+@pytest.mark.machines
 def test_effects_are_declared_by_name(recording):
     excess = float(np.sqrt(STD**2 - (1.0 / 20e3) ** 2 / 12.0))
     found = close_loop(recording, {**KEYWORDS, 'effects': {'excess_jitter': {'std': excess}}})
@@ -73,6 +74,7 @@ def test_effects_are_declared_by_name(recording):
     assert found.verdict == 'none'
 
 
+@pytest.mark.machines
 @pytest.mark.usefixtures('undrawn')
 def test_written_report_is_the_report(found, tmp_path):
     found.write(tmp_path / 'a' / 'b')
@@ -156,6 +158,7 @@ def test_pulses_without_any_jitter_have_a_report(name, tmp_path):
     assert (tmp_path / 'pulse_errors.png').is_file()
 
 
+@pytest.mark.machines
 def test_table_of_a_single_error_declares_no_jitter(recording):
     with np.errstate(divide='raise', invalid='raise'):
         assert close_loop(recording, {
@@ -219,6 +222,7 @@ def test_unusable_input_is_named(recording, tmp_path):
         close_loop(tmp_path / 'none.npz', KEYWORDS)
 
 
+@pytest.mark.machines
 def test_figures_are_not_loaded_before_they_are_drawn():
     code = ('import sys, sa_jitter_ros.loop; '
             'raise SystemExit(bool({"matplotlib", "rclpy"} & sys.modules.keys()))')

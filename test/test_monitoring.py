@@ -335,6 +335,7 @@ def test_order_that_was_not_there_appears():
     assert line.startswith('order 1 of input, channel 0: +')
 
 
+@pytest.mark.machines
 def test_absent_order_has_a_baseline_without_bias():
     """An average that is large by chance publishes no larger error, and counts as any other."""
     machine = Machine(16)
@@ -351,6 +352,7 @@ def test_absent_order_has_a_baseline_without_bias():
 # --- what is no change ---------------------------------------------------------------------------
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('worse', [{'keyphasor': 2.0}, {'bias': 0.01},
                                    {'keyphasor': 4.0, 'bias': 0.05}])
 def test_worse_keyphasor_is_no_change_of_the_machine(worse):
@@ -396,6 +398,7 @@ def test_speeds_have_baselines_of_their_own():
     assert found.change == pytest.approx(0.05, abs=4.0 * found.standard_error)
 
 
+@pytest.mark.machines
 def test_covariance_is_that_of_the_machine():
     machine = Machine(9, load=0.02)
     monitor = machine.monitor()
@@ -617,6 +620,7 @@ def damage(path, kind):
     path.write_bytes(content)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('kind', ['cut', 'empty', 'text', 'bits'])
 def test_damaged_file_is_refused_in_one_line_and_kept(kept, kind):
     path = kept[2]

@@ -50,11 +50,13 @@ def crossings(gain, *, averages=2000, **limit):
         np.sum(above[:-1]), 1)
 
 
+@pytest.mark.machines
 def test_scatter_at_a_limit_crosses_it_once_in_forty_averages():
     for share in crossings(1.0):
         assert share == pytest.approx(0.025, abs=4.0 * math.sqrt(0.025 * 0.975 / 900))
 
 
+@pytest.mark.machines
 def test_scatter_below_a_limit_is_no_alarm():
     below = 1.0 - 2.0 * NOISE  # 4 standard errors from an alarm: 0.00004 of the averages
     assert crossings(below)[0] <= 0.001

@@ -63,6 +63,7 @@ def test_a_load_that_changes_is_no_damage_where_bins_are_set():
     assert found.change == pytest.approx(0.1, abs=4.0 * found.standard_error)
 
 
+@pytest.mark.machines
 def test_false_alarms_of_a_changing_load_are_those_of_a_steady_one():
     alarms = sum(len(Loaded(seed, replace(LEARNING, state_bin=40.0)).run(400))
                  for seed in range(5))

@@ -96,6 +96,7 @@ def test_the_level_of_a_summary_is_that_of_the_worst_limit(ros_graph, bench):
     assert 'order 7 of shaft, channel 1: ' in second.message
 
 
+@pytest.mark.machines
 def test_summaries_of_sliding_averages_come_once_a_second(ros_graph, bench):
     summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
     b = bench(averaging='sliding')
@@ -264,6 +265,7 @@ def test_imu_axes_are_channels(bench, rng):
     assert b.status()['clock_deviation'] == 0
 
 
+@pytest.mark.machines
 def test_imu_losses_repeats_and_restarts_are_detected(bench):
     machine = Machine(speed=8.0, rate=400.0, components={1.0: (1.0, 0.4)}, channels=1)
     b = bench(vibration_type='sensor_msgs/Imu', sample_rate=400.0, shaft__orders=[1.0])
@@ -287,6 +289,7 @@ def test_imu_losses_repeats_and_restarts_are_detected(bench):
     assert_true(b.amplitudes(), machine, [1.0], rtol=1e-3)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('stamps', 'words'), [
     (np.arange(600) / 150.0, 'its stamps come 150 times a second, sample_rate declares 400 Hz'),
     (np.arange(800) // 20 / 20.0 + np.arange(800) % 20 * 1e-5, 'its stamps come in bursts, 4')])
@@ -504,6 +507,7 @@ def test_parameters_are_described_with_their_ranges(bench):
     assert values[1].integer_value == 10
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'value', 'stored'), [
     ('trigger_cycles', 5, 5), ('shaft.orders', [1, 7], [1.0, 7.0]), ('shaft.ratio', 2, 2.0),
     ('averaging', 'sliding', 'sliding'), ('angle_law', 'spline', 'spline'),
@@ -729,6 +733,7 @@ def test_main_says_in_one_line_what_is_wrong(process_environment, argument, says
     assert says in line
 
 
+@pytest.mark.machines
 def test_the_geometry_of_the_target_is_published_and_kept_for_later_subscribers(bench, ros_graph):
     late = np.array([0.012, -0.004, 0.0, -0.008])
 

@@ -80,6 +80,7 @@ class SceneBench:
         return well
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('averaging', 'seed', 'scenes'), [('block', 1, 2), ('sliding', 3, 1)])
 def test_every_average_is_true_in_spite_of_faults(ros_graph, averaging, seed, scenes):
     b = SceneBench(ros_graph, seed, averaging=averaging)
@@ -230,6 +231,7 @@ def test_check_of_corrected_averages_detects_errors(corrected):
         check_correction('shaft', item, place, [{**DETECTED, 'correct_jitter': False}])
 
 
+@pytest.mark.machines
 def test_check_of_residuals_detects_errors(corrected):
     amplitudes = [item.amplitude for item, _ in corrected]
     order = amplitudes[0].values[0, :, 0]

@@ -63,6 +63,7 @@ class MonitorBench(NodeBench):
         return json.loads(self.received['change'][-1].data, parse_constant=pytest.fail)
 
 
+@pytest.mark.machines
 def test_learns_then_names_the_change(ros_graph):
     b, machine = MonitorBench(ros_graph), DrawnMachine(1)
     assert b.change() == {'baseline': {'averages': 0, 'complete': False}, 'changes': []}
@@ -151,6 +152,7 @@ def test_speeds_that_are_never_learnt_are_said(ros_graph):
     assert not b.change()['baseline']['complete']
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('stamped', [False, True])
 def test_a_load_that_changes_is_no_change_of_the_machine(ros_graph, stamped):
     kind = Float64MultiArray if stamped else Float64
@@ -353,6 +355,7 @@ def learned(tmp_path):
     return machine, path, content
 
 
+@pytest.mark.machines
 def test_baseline_and_changes_survive_a_restart(learned):
     machine, path, content = learned
     with running(baseline_file=str(path)) as b:
@@ -377,6 +380,7 @@ def test_corrupt_file_is_refused_and_kept(learned, capfd):
     assert path.read_bytes() == before
 
 
+@pytest.mark.machines
 def test_relearn_begins_a_baseline_and_keeps_the_file_of_the_old_one(learned):
     machine, path, content = learned
     before = path.read_bytes()

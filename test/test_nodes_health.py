@@ -263,6 +263,7 @@ def test_refused_correction_stays_a_warning(ros_graph, rng):
     assert b.diagnostics()[0] == OK
 
 
+@pytest.mark.machines
 def test_a_few_refused_corrections_are_a_warning_until_enough_were_accepted(ros_graph, rng):
     b = AveragerBench(ros_graph, trigger_cycles=10, correct_jitter=True)
     b.play(MACHINE, 1.0, change=noise_of(rng))

@@ -53,6 +53,7 @@ def test_every_openblas_is_limited_to_one_thread():
     assert set(counts) == {1}
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', ['OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'])
 def test_number_of_threads_in_the_environment_is_kept(name):
     found, counts = threads(**{name: '2'})

@@ -357,6 +357,7 @@ def test_undefined_numbers_are_null(bench):
     assert b.part('missing_effect') == {'a': None, 'b': None, 'c': None, 'd': 1.5}
 
 
+@pytest.mark.machines
 def test_histories_follow_time_and_are_bounded(bench):
     b = bench()
     for k in range(40):
@@ -433,6 +434,7 @@ BAD = {
 }
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('bad', BAD)
 def test_a_malformed_message_is_counted_and_not_shown(bench, bad):
     b = bench()

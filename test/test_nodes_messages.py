@@ -173,6 +173,7 @@ def test_imu_repeat_keeps_its_index_and_a_coarse_stamp_does_not():
     assert imu_blocks([0.0, 0.001, 0.001, 0.003], rate=1000.0) == [0, 1, 2, 3]
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('source_rate', [970.0, 990.0, 999.0, 999.9, 1001.0, 1010.0, 1030.0])
 def test_imu_of_a_slightly_other_rate_loses_nothing(source_rate):
     count = 20_000 if source_rate == 999.9 else 4000  # off by two samples or more
@@ -195,6 +196,7 @@ def test_imu_stamp_that_is_late_once_is_no_loss(stamps, indices):
     assert imu_blocks(100.0 + 0.005 * np.array(stamps), rate=200.0) == indices
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('jitter', [
     lambda rng, count: rng.uniform(-0.7, 0.7, count),
     lambda rng, count: 0.2 * rng.standard_normal(count),

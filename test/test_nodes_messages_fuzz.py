@@ -151,6 +151,7 @@ NODES = {
 }
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', NODES)
 def test_no_message_ends_a_node(ros_graph, name):
     node_class, parameters, inputs = NODES[name]

@@ -88,6 +88,7 @@ NODES = {
 }
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', NODES)
 def test_any_parameters_are_refused_or_used(ros_graph, recording, name, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # of files with a random relative name

@@ -141,6 +141,7 @@ def test_prediction_of_another_average_is_not_compared(change, reason):
         require_comparable(averages, published(**change))
 
 
+@pytest.mark.machines
 def test_trace_names_the_effect_and_its_size():
     found = trace_averages(synthetic(20, std=5e-5), MODEL)
     assert found.verdict == 'traced'
@@ -169,6 +170,7 @@ def test_trace_names_indistinguishable_effects():
     assert 'speed_fluctuation' in report(found)['missing_effects'][0]['indistinguishable_from']
 
 
+@pytest.mark.machines
 def test_trace_does_not_repeat_declared_effects():
     averages = synthetic(20, std=5e-5)
     assert trace_averages(synthetic(20), MODEL).verdict == 'none'
@@ -177,6 +179,7 @@ def test_trace_does_not_repeat_declared_effects():
     assert [item.name for item in found.declared] == ['excess_jitter']
 
 
+@pytest.mark.machines
 def test_trace_takes_the_longest_stretch_without_a_gap():
     averages = synthetic(14, std=5e-5)
     del averages[3]
@@ -288,6 +291,7 @@ def bench(ros_graph):
     return lambda **options: AnalyserBench(ros_graph, **options)
 
 
+@pytest.mark.machines
 def test_batch_is_compared_and_traced_without_a_predictor(bench, clock):
     b = bench()
     b.predict()
@@ -320,6 +324,7 @@ def test_missing_effect_is_latched(bench, clock):
     assert json.loads(late[0].data)['verdict'] == 'none'
 
 
+@pytest.mark.machines
 def test_absent_predictor_is_a_diagnostic(bench, clock):
     b = bench(close_loop=True, predictor='elsewhere')
     b.predict()
@@ -367,6 +372,7 @@ def test_averages_without_correction_are_refused(bench):
     assert b.diagnostics()[1].startswith('comparison: without 7 of the latest 10 averages, ')
 
 
+@pytest.mark.machines
 def test_averages_with_unresolved_pulses_are_counted(bench):
     b = bench(predictor='test')  # which is none
     b.predict()
@@ -456,6 +462,7 @@ def test_bad_messages_are_counted(bench):
     assert b.diagnostics()[2]['averages'] == '0'
 
 
+@pytest.mark.machines
 def test_node_that_is_no_predictor_is_reported(bench):
     b = bench(predictor='test')  # the graph's node has parameter services, not the parameters
     b.predict()
@@ -493,6 +500,7 @@ def test_effects_are_set_in_the_predictor_and_a_refusal_is_reported(bench, ros_g
     assert b.residuals()[2].chi2_per_dof < 2.0
 
 
+@pytest.mark.machines
 def test_one_of_several_predicted_shafts_is_compared(bench, ros_graph):
     ros_graph.add(JitterPredictor, {
         'keyphasor_rate': CLOCK, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,

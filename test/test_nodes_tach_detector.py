@@ -324,6 +324,7 @@ def test_joint_gives_corrected_orders(ros_graph, rng):
     assert predicted.mean_attenuation[1] < 0.98
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('kind', ['zeros', 'overflow', 'jump'])
 def test_joint_with_glitches_overflows_and_jumps_gives_every_pulse(ros_graph, kind):
     """14 pulses of 7.3 Hz, 2 s at 500 Hz, as without what is wrong."""

@@ -133,6 +133,7 @@ def test_the_table_has_a_row_for_each_average_channel_and_order(rig, tmp_path):
     assert not any(row['note'] for row in rows)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('unit', 'volts'), [('V', 1.0), ('mV', 1e-3), ('', 1.0)])
 def test_volts_become_units_once(recording, rig, tmp_path, unit, volts):
     sensitivity = np.array([[0.1], [-0.05]])
@@ -231,6 +232,7 @@ def test_recording_that_ends_in_the_middle_keeps_what_came_before(rig, tmp_path,
     assert 'rig.csv' in captured.err
 
 
+@pytest.mark.machines
 def test_figures_of_a_run_up_with_gear(tmp_path):
     machine = Gearbox(mesh('shaft', 11, harmonics=(1.0, 0.5)), RATE,
                       speed=((0.0, 10.0), (4.0, 20.0)), seed=1, effects=(AdditiveNoise(0.1),))

@@ -76,6 +76,7 @@ def weeks(tmp_path_factory):
     return place / 'in', place / 'out'
 
 
+@pytest.mark.machines
 def test_a_bearing_fault_is_found_with_the_day_on_which_it_began(weeks):
     found = answer(weeks[1])
     assert found['baseline'] == {'averages': LEARNING, 'complete': True}
@@ -88,6 +89,7 @@ def test_a_bearing_fault_is_found_with_the_day_on_which_it_began(weeks):
     assert found['recordings'] == [f'day_{number:02d}' for number in range(1, DAYS + 1)]
 
 
+@pytest.mark.machines
 def test_the_figure_shows_what_changed_first(weeks, tmp_path):
     names = [f'day_{number:02d}' for number in range(1, DAYS + 1)]
     changes = find_changes(weeks[1], names, settings_of(
@@ -146,6 +148,7 @@ def test_healthy_days_show_no_change(weeks, capsys):
     assert answer(out)['changes'] == answer(out)['events'] == []
 
 
+@pytest.mark.machines
 def test_a_bad_day_costs_itself_and_is_named(tmp_path, capsys):
     days = {number: day(number) for number in range(1, DAYS + 1)}
     days[3] = day(3, channels=2)
@@ -238,6 +241,7 @@ def loads(tmp_path_factory):
             LEARNING, *SETTINGS)
 
 
+@pytest.mark.machines
 def test_a_load_that_changes_is_a_change_where_it_is_not_known(loads):
     assert run(*loads) == 0
     texts = [event['text'] for event in answer(loads[2])['events']]
@@ -266,6 +270,7 @@ def test_averages_outside_the_gate_do_not_count(loads, capsys):
     assert f'no change in 4 recordings after the baseline of {LEARNING}' in told.out
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('arguments', 'text'), [
     (('--state', 'power', '-p', 'state_bin:=80'), 'are the baseline: give 10 or more; their '
      'averages are written; day_01 has no channel power'),

@@ -107,6 +107,7 @@ def test_stopped_run_leaves_nothing_half_done(tmp_path, monkeypatch, capfd):
     assert list((tmp_path / 'out').rglob('*')) == [tmp_path / 'out' / 'a']
 
 
+@pytest.mark.machines
 def test_full_disk_is_one_line_and_what_was_finished_stays(tmp_path, monkeypatch, capfd):
     machine = Gearbox(mesh('shaft', 8), 5000.0, speed=((0.0, 25.0),), seed=3)
     for name in 'ab':

@@ -67,6 +67,7 @@ def simulate(model, order, iterations, seed):
                               iterations, seed=seed, line_variance=noise))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('changes', 'order', 'bias'), [
     ({}, 38.0, 0.004),
     ({'ratio': 0.4137, 'trigger_cycles': 3, 'jitter_distribution': 'table',
@@ -174,6 +175,7 @@ def slow_wander(std):
     return GaussianAngleError(lambda u, v, lag: std**2 * 0.8 ** np.abs(lag + v - u), 40)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('cycles', 'std'), [(41, 0.05), (41, 0.15), (130, 0.1)])
 def test_slow_wander_is_predicted_beside_jitter(cycles, std, rng):
     model = replace(MODEL, orders=(38.0,), trigger_cycles=cycles)

@@ -94,6 +94,7 @@ def test_tiny_scatter_keeps_its_digits():
 
 # Kolmogorov-Smirnov: with n draws the 0.1 % point is 1.95 / sqrt(n); the own error is what
 # is added: none where it is exact enough for n.
+@pytest.mark.machines
 @pytest.mark.parametrize(('distribution', 'order', 'cycles', 'bias'), [
     (Uniform(1.0), 0.3, 100, 0.0), (Uniform(1.0), 0.8, 60, 0.0), (Triangular(0.2), 0.9, 40, 0.0),
     (Normal(0.25), 0.4, 20, 0.0), (Uniform(1.0), 0.5, 10, 0.014), (Normal(0.25), 0.5, 10, 0.008),

@@ -154,6 +154,7 @@ def test_required_rate_never_lets_pulses_swap():
     assert loss(replace(model, keyphasor_rate=rate))[0] < 0.5
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('changes', [{}, {'noise_std': 1.0, 'sample_rate': 5e4}])
 def test_required_cycles_are_the_fewest_from_which_on_the_limit_holds(changes):
     model = replace(MODEL, orders=(38.0,), **changes)

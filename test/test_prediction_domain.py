@@ -58,6 +58,7 @@ def anywhere(draw, most_cycles=1_000_000):
                    share / (width * speed), unit)
 
 
+@pytest.mark.machines
 @settings(max_examples=50, deadline=None)
 @given(anywhere())
 def test_moments_and_quantiles_are_in_order_everywhere(setting):
@@ -82,6 +83,7 @@ def test_predictions_are_those_of_drawn_averages(seed):
     assert not found.is_off(count), (setting, found)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('seed', range(12))
 def test_predictions_with_effects_are_those_of_drawn_averages(seed):
     """Pulses that remember each other, alternate or drift, of marks that are uneven."""
@@ -125,6 +127,7 @@ def test_predictions_with_effects_are_those_of_drawn_averages(seed):
     np.testing.assert_allclose(ranks, [0.05, 0.5, 0.95], atol=0.018)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('effects', 'cycles'), [
     ({'correlated_jitter': {'std': 8e-5, 'correlation': -0.7}}, 50),
     ({'correlated_jitter': {'std': 6e-5, 'correlation': -0.7}}, 140),
@@ -174,6 +177,7 @@ def test_single_cycles_are_as_a_quadrature_says():
         assert prediction.standard_deviation[0] == pytest.approx(std, rel=0.01)
 
 
+@pytest.mark.machines
 @settings(max_examples=14, deadline=None)
 @given(anywhere(most_cycles=1000), logarithmic(1e-9, 1e-3))
 def test_without_jitter_nothing_is_lost(setting, factor):
@@ -216,6 +220,7 @@ NOTHING = {
     'missing_pulses': 'probability'}
 
 
+@pytest.mark.machines
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(sorted(NOTHING)), st.sampled_from([0.0, 1e-18, 1e-13]),
        st.sampled_from([1, 5, 12, 40]), logarithmic(1e3, 1e9))

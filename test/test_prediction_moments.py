@@ -82,6 +82,7 @@ def test_small_jitter_has_the_limits_of_a_taylor_series():
         assert moments.real_variance[0] == pytest.approx(fourth * angle**2 / 500, rel=5e-3)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('distribution', [
     Uniform(0.9), Triangular(0.2), EXPONENTIAL, Normal(0.15)],
     ids=lambda distribution: type(distribution).__name__)

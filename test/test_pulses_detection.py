@@ -72,6 +72,7 @@ def test_threshold_given_without_hysteresis_needs_no_learning():
     assert pulses.size == 1
 
 
+@pytest.mark.machines
 @settings(max_examples=20)
 @given(cuts=st.lists(st.integers(0, 20_000), max_size=40),
        edge=st.sampled_from(['rising', 'centre']), interpolate=st.booleans(),
@@ -270,6 +271,7 @@ def tach(kind, rng, *, rate=5000.0, seconds=10.0, speed=20.0):
     }[kind] + 0.01 * rng.standard_normal(t.size)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('size', [60.0, 15.0, 50.0, -60.0, -20.0])
 @pytest.mark.parametrize('threshold', [None, 2.5])
 def test_one_spike_costs_no_pulse_and_makes_none(size, threshold, rng):
@@ -295,6 +297,7 @@ def test_pulses_with_two_lobes(kind, threshold, rng):
         assert detector.state.threshold == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('kind', ['eddy probe', 'coupled', 'hum', 'steps of 8 bit'])
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_waveforms_of_sensors(kind, sign, rng):
@@ -358,6 +361,7 @@ def far(times, bad, reach):
     return times[np.minimum(times - bad[after - 1], bad[after] - times) > reach]
 
 
+@pytest.mark.machines
 def test_spoilt_samples_cost_only_the_pulses_near_them():
     """Whatever their number, place and size: all but those within 1 s or 10 turns are the same."""
     wrong, trials = 0, 60

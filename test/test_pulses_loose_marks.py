@@ -42,6 +42,7 @@ def _said(times, marks, blocks=7):
     return lines, validator.counts.displaced
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('marks', [1, 2, 3, 4])
 @pytest.mark.parametrize(('share', 'off'), [(0.2, 0.3), (0.4, -0.1), (0.4, 0.4)])
 def test_a_loose_mark_is_said_once(marks, share, off):
@@ -52,6 +53,7 @@ def test_a_loose_mark_is_said_once(marks, share, off):
     assert _said(times, marks, blocks=90) == ([line], displaced)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('marks', [1, 2, 4])
 @pytest.mark.parametrize('machine', [
     {'jitter': 0.01}, {'jitter': 0.03}, {'scatter': 0.3}, {'ramp': 0.3}, {'ramp': -0.3}])
@@ -60,6 +62,7 @@ def test_no_other_machine_has_a_loose_mark(marks, machine):
         assert _said(_times(seed, marks, **machine), marks) == ([], 0)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('marks', [1, 4])
 def test_lost_and_stray_pulses_and_clocks_are_no_loose_mark(marks):
     times, size = _times(5, marks), 11 * marks  # pulses fitted at once

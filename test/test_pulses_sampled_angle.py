@@ -261,6 +261,7 @@ def test_glitches_anywhere_leave_the_pulses_and_any_cut_is_the_same(kind, seed):
     assert other.state.restarts == crossings.state.restarts
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('counts', [8, 24, 60, 360])
 def test_coarse_and_held_positions_have_no_glitches(rng, counts):
     """A standing or slow shaft moves by rare steps, noise moves it to and fro."""

@@ -70,6 +70,7 @@ def spoilt(rng, pulses, fault):
     return np.sort(np.append(given[keep], extra))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('unsteady', [False, True])
 @pytest.mark.parametrize('wheel', WHEELS)
 def test_no_trigger_cycle_is_wrong(wheel, unsteady):
@@ -146,6 +147,7 @@ def test_intervals_of_one_mark_are_in_no_turns(rng, clock):
         assert not validator.take_messages()
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('marks', [1, 2, 4])
 def test_a_displaced_pulse_in_the_first_revolutions_is_in_no_cycle(rng, marks):
     for trial in range(60):
@@ -158,6 +160,7 @@ def test_a_displaced_pulse_in_the_first_revolutions_is_in_no_cycle(rng, marks):
         assert found.size > 54
 
 
+@pytest.mark.machines
 def test_a_displaced_pulse_is_known_from_the_jitter_of_the_first_revolutions():
     """Five revolutions of few marks tell their jitter, also with one pulse displaced."""
     used = lost = 0
@@ -175,6 +178,7 @@ def test_a_displaced_pulse_is_known_from_the_jitter_of_the_first_revolutions():
     assert lost <= 30
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('again', [False, True])
 def test_a_displaced_pulse_beside_a_gap_is_no_pattern_of_two_marks(again):
     """Nor does it tell the scatter, at the start and behind a loss of the match."""
@@ -232,6 +236,7 @@ def test_a_wrong_interval_alone_is_no_scatter(rng):
         assert 1e-3 < steady_pattern(np.arange(20) % 2, levels, 2).scatter < 0.01
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('place', range(5, 12))
 def test_displaced_pulses_in_the_first_revolutions_are_in_no_cycle(place, rng):
     """Nor in those behind: the tolerance that they teach is that of the others."""
@@ -364,6 +369,7 @@ def test_pulses_are_no_strays_beside_the_first_few_that_scatter_less(marks, seed
     assert accepted_alone(pulses, pulses_per_revolution=marks)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('shape', 'per_revolution'), [
     ('uniform', 1), ('uniform', 4), ('normal', 1), ('normal', 4), ('bimodal', 1)])
 def test_large_errors_are_no_strays(shape, per_revolution):
@@ -438,6 +444,7 @@ def test_a_wheel_that_changes_its_pattern_is_learnt_again(rng):
     assert found.times.size > 40
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('share', [0.1, 0.15])
 def test_missing_pulses_beside_steps_of_a_clock_cost_themselves_only(share):
     """Pulses missing in turns are no shaft at half the speed, and a tick is no displacement."""

@@ -77,6 +77,7 @@ def test_standard_errors_are_those_of_white_jitter(rng, teeth, present, speeds):
     assert np.mean((off / stated)**2) == pytest.approx(1.1, abs=0.1 + 4.0 * np.sqrt(2.0 / free))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('teeth', 'present'), [(4, 4), (36, 35)])
 def test_order_60_of_uneven_marks_is_that_of_even_ones(rng, teeth, present):
     late = rng.normal(0.0, 0.08 / teeth, present)

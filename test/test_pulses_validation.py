@@ -270,6 +270,7 @@ def test_minimum_interval_removes_a_burst():
     assert runs[-1].size >= 20
 
 
+@pytest.mark.machines
 @settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 600), max_size=30),
        wheel_teeth=st.booleans(), bridge=st.booleans())
@@ -503,6 +504,7 @@ def test_denormal_intervals_are_no_overflow():
     validate(np.concatenate((tiny, 1.0 + np.arange(10.0) / 30.0)))
 
 
+@pytest.mark.machines
 def test_the_first_revolutions_of_two_marks_lose_no_pulse_by_jitter():
     """By chance some revolutions of two marks repeat more narrowly than the jitter is."""
     rng = np.random.default_rng(1)
@@ -560,6 +562,7 @@ def uneven_encoder(rng, scatter, alike, count=800):
     return 1.0 + np.cumsum(np.exp(scatter * levels)) / (16.0 * 4.0)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('alike', [0.0, 0.5, 0.8, 0.95])
 @pytest.mark.parametrize('scatter', [0.1, 0.2, 0.3])
 def test_a_clean_encoder_on_a_machine_that_turns_unevenly_loses_next_to_nothing(scatter, alike):
@@ -589,6 +592,7 @@ def test_an_encoder_of_a_motor_that_turns_unevenly_loses_nothing(shared_data):
     assert 'a stray or a missing one does not show' in message
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('jitter', [0.0, 0.01, 0.02, 0.036])
 def test_lost_pulses_beside_jitter_are_missing(jitter):
     """Of 36 marks 3 % are lost, whose neighbours are displaced by up to a tenth of an interval."""
@@ -611,6 +615,7 @@ def test_lost_pulses_beside_jitter_are_missing(jitter):
     assert turns >= 0.97 * 6 * 99
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('share', [0.1, 0.2, 0.3])
 def test_missing_pulses_are_no_speed_that_scatters(share):
     """Of one mark with jitter of up to 3 %, from which up to a third of the pulses is missing."""

@@ -92,6 +92,7 @@ def test_a_model_refuses_an_unknown_law():
         replace(MODEL, angle_law='cubic')
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('law', 'changes'), [
     ('quadratic', {'trigger_cycles': 4}),
     ('spline', {'jitter_distribution': 'normal', 'trigger_cycles': 12}),
@@ -152,6 +153,7 @@ def test_known_pulse_errors_make_the_angle_error_of_the_law(law, rng):
             row, abs=1e-6)
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('law', OTHERS)
 def test_correlated_jitter_and_geometry_go_through_the_law(law, rng):
     model = replace(MODEL, angle_law=law)
@@ -187,6 +189,7 @@ def unsteady(model, acceleration_std, rng):
     return averaged(model, pulses[None], true_times)[0]
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('law', OTHERS)
 def test_speed_fluctuation_is_what_the_law_cannot_follow(law, rng):
     model = replace(MODEL, angle_law=law, keyphasor_rate=1e9, orders=(30.0, 60.0))

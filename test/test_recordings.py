@@ -804,6 +804,7 @@ def test_npz_that_is_cut_off_says_so(recording, tmp_path):
         read(tmp_path / 'cut.npz')
 
 
+@pytest.mark.machines
 def test_a_table_of_a_hundred_thousand_columns_gets_a_short_line(tmp_path):
     path = tmp_path / 'wide.csv'
     path.write_text('1,' * 1_000_000 + '1\n')
@@ -1160,6 +1161,7 @@ def test_pulses_beyond_2038_need_an_array(tmp_path):
     np.testing.assert_array_equal(opened.pulse_times, late.pulse_times)
 
 
+@pytest.mark.machines
 def test_imu_bag_is_played_by_its_stamps(tmp_path, rng):
     stamps = 100.0 + (np.arange(4000) + rng.uniform(-0.7, 0.7, 4000)) / 1000.0
     opened = read(imu_bag(tmp_path / 'jitter', stamps), sample_rate=1000.0)

@@ -82,6 +82,7 @@ def refusal(path, **options):
     return ''
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('name', [
     'stored.npz', 'deflated.npz', 'v5.mat', 'v7.mat', 'rig.wav', 'rig.csv', 'mcap.mcap',
     'sqlite3.db3'])

@@ -128,6 +128,7 @@ def everything():
             whole.pulses(0.0, 9000 / RATE))
 
 
+@pytest.mark.machines
 @settings(max_examples=15)
 @given(cuts=st.lists(st.integers(0, 9000), max_size=6))
 def test_signals_do_not_depend_on_the_cuts(everything, cuts):

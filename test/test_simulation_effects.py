@@ -144,6 +144,7 @@ def test_effects_on_pulses_leave_the_vibration_alone():
 
 # --- shaft and vibration ------------------------------------------------------------------------
 
+@pytest.mark.machines
 def test_acceleration_of_the_shaft():
     gearbox = machine(one('speed_fluctuation', acceleration_std=2.0))
     times, step = np.arange(0, 2000.0, 0.01), 1e-4
@@ -164,6 +165,7 @@ def cycle_amplitudes(gearbox, orders, cycles):
     return 2 * (signal * waves).reshape(len(orders), cycles, 64).mean(axis=2)
 
 
+@pytest.mark.machines
 def test_phase_wander_attenuates_all_orders_of_a_shaft_alike():
     std = 0.12
     gearbox = machine(one('phase_wander', std=std), orders=(4.0, 8.0))
@@ -186,6 +188,7 @@ def test_phase_wander_differs_between_shafts():
     assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(0.76 * 4000)
 
 
+@pytest.mark.machines
 def test_amplitude_modulation_scatters_without_bias():
     gearbox = machine(one('amplitude_modulation', std=0.2), orders=(4.0, 8.0))
     first, second = cycle_amplitudes(gearbox, (4.0, 8.0), 8000)

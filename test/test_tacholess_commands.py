@@ -73,12 +73,14 @@ def test_average_without_a_tach(folder, capsys):
         assert abs(corrected - 1.0) < 5.0 * error
 
 
+@pytest.mark.machines
 def test_lost_tach_is_bridged(folder, capsys):
     assert average.main([str(folder / 'lost.npz'), *TACHOLESS, '--bridge-tach', '--output',
                          str(folder / 'bridged'), '--no-figures']) == 0
     assert '20 pulses that the tach lost were found in the vibration' in capsys.readouterr().err
 
 
+@pytest.mark.machines
 @pytest.mark.usefixtures('undrawn')
 def test_check_and_loop_without_a_tach(folder, capsys):
     assert check_keyphasor.main([str(folder / 'rig.npz'), *TACHOLESS, '--output',
@@ -109,6 +111,7 @@ def test_refusals_are_one_line_and_write_nothing(folder, words, message, capsys)
     assert not list(output.glob('*/averages.npz'))
 
 
+@pytest.mark.machines
 def test_orders_of_the_machine_file_and_a_second_run(folder, capsys):
     """The comb follows from the gears; what is finished is skipped, unless the range differs."""
     (folder / 'machine.yaml').write_text("""
@@ -132,6 +135,7 @@ def test_orders_of_the_machine_file_and_a_second_run(folder, capsys):
     assert 'pulses from orders 19, 38, at ' in capsys.readouterr().err
 
 
+@pytest.mark.machines
 @pytest.mark.usefixtures('undrawn')
 def test_loop_of_a_folder_without_a_tach(folder):
     several = folder / 'several'

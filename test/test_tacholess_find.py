@@ -51,6 +51,7 @@ def run_up():
     return vibration, angle, sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=RANGE)
 
 
+@pytest.mark.machines
 def test_pulses_of_a_run_up(run_up):
     _, angle, found = run_up
     assert found.reason == ''
@@ -64,6 +65,7 @@ def test_pulses_of_a_run_up(run_up):
     assert np.mean(np.abs(speed) < 1.96) > 0.85
 
 
+@pytest.mark.machines
 def test_errors_whitened_by_their_covariance_are_independent():
     """Their sum of squares is that of the directions in which pulses err most."""
     squares = freedom = 0.0
@@ -92,6 +94,7 @@ def test_covariance_agrees_with_standard_errors_and_parts(run_up):
     np.testing.assert_allclose(part, difference, atol=1e-9 * np.abs(part).max() + 1e-12)
 
 
+@pytest.mark.machines
 def test_used_orders_are_too_large_and_others_too_small():
     """By as much as is expected: both are of the same averages, whose noise does not count."""
     rows = []
@@ -149,6 +152,7 @@ def test_gap_ends_the_pulses_and_a_dead_channel_costs_itself(run_up):
     assert np.abs(error(replace(found, times=found.times - 100.0), angle)).max() < 0.005
 
 
+@pytest.mark.machines
 def test_pulses_end_where_the_lines_do(run_up):
     """Ten seconds of lines, then their noise alone."""
     vibration, angle, _ = run_up
@@ -161,6 +165,7 @@ def test_pulses_end_where_the_lines_do(run_up):
     assert np.abs(error(found, angle)).max() < 0.005
 
 
+@pytest.mark.machines
 def test_few_lost_samples_cost_nothing(run_up):
     vibration, angle, whole = run_up
     broken = vibration.copy()
@@ -282,6 +287,7 @@ def test_states_are_those_of_the_dense_model():
     assert evidence[1] - evidence[0] == pytest.approx(dense[1] - dense[0], abs=0.02)
 
 
+@pytest.mark.machines
 def test_run_up_through_resonances():
     """Each line turns by itself where it passes a resonance; the errors stated grow with it."""
     rng = np.random.default_rng(101)

@@ -66,6 +66,7 @@ def off(found, angle):
     return error - error.mean()
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize('motion', MOTIONS, ids=lambda motion: motion.__name__)
 @pytest.mark.parametrize('orders', [(1.0, 2.0, 3.0, 4.0), (17.0, 23.0, 46.0)], ids=str)
 def test_motion_is_followed(motion, orders):
@@ -98,6 +99,7 @@ def test_resonance_of_the_noise_attracts_nothing():
     assert np.abs(off(found, angle)).max() * 51.0 < 0.1
 
 
+@pytest.mark.machines
 def test_a_channel_without_lines_costs_nothing():
     rng = np.random.default_rng(10)
     vibration, angle = shown(wander(rng), (17.0, 34.0, 51.0), rng)

@@ -61,6 +61,7 @@ def test_a_flight_without_noise_is_that_of_the_model_but_for_the_wander_of_the_s
     assert measured == pytest.approx(modelled, abs=1e-3)  # what leaks from sidebands
 
 
+@pytest.mark.machines
 def test_flights_are_shared_out_among_all_helicopters():
     flights = fleet.fly(16, ignore)
     assert [len(item.ratios) for item in flights] == [2, 2] + 12 * [1]

@@ -24,6 +24,7 @@ from validation.analytic import multi_harmonic_moments
 EXPONENTIAL = Empirical(np.random.default_rng(8).exponential(0.15, 3000))
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('ratio', 'cycles'), [(1.0, 6), (2.0, 3), (0.4137, 3), (5.8154, 4)])
 def test_leakage_between_components(ratio, cycles, rng):
     distribution, sources, amplitudes = EXPONENTIAL, (1.0, 2.0, 3.0), (1.0, 0.5j, -2.0)
