@@ -243,7 +243,7 @@ def test_simulated_gearbox_is_that_of_the_machine_file(live):
     assert plan.channels == ('input bearing', 'output bearing')
     nodes = demo.processes(plan, live=live)
     assert nodes['machine_simulator'] == {
-        'playing': False, 'duration': 0.0 if live else plan.seconds}
+        'playing': False, 'wait_seconds': 60.0, 'duration': 0.0 if live else plan.seconds}
     assert ('live_view' in nodes) == live
     command = demo.node_command('jitter_predictor', nodes['jitter_predictor'], plan.params)
     assert command[command.index('--params-file') + 1] == str(path)

@@ -150,7 +150,7 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
     """
     nodes: dict[str, dict[str, object]] = {
         'synchronous_averager': {}, 'jitter_predictor': {},
-        plan.source: {**plan.source_parameters, 'playing': False}}
+        plan.source: {**plan.source_parameters, 'playing': False, 'wait_seconds': 60.0}}
     if plan.params is None:
         model = plan.model
         keyphasor = {name: getattr(model, name) for name in (
