@@ -219,34 +219,32 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
     """
     memory = Memory() if memory is None else memory
     memory.make_room()
-
-    def shown_by(key: tuple[Influence, ...]) -> tuple[_Shown, ...]:
-        alike: dict[float, list[int]] = {}
-        for a in chosen:
-            if (key, a) not in memory.shown:
-                speed = _speed(observation.acquisitions[a], observation.model)
-                alike.setdefault(speed, []).append(a)
-        for speed, some in alike.items():
-            setting = _setting(observation, speed, key)
-            found = iter(setting.shown([item for a in some for item in pulses[a]]))
-            for a in some:
-                memory.keep((key, a), [
-                    _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
-                    for i, _ in enumerate(pulses[a])])
-            for amplitudes in setting.made:
-                memory.count(amplitudes)
-        return _together([[replace(item, index=item.index + n * lines.count)
-                           for item in memory.shown[key, a]] for n, a in enumerate(chosen)])
-
-    shown = shown_by(tuple(effects))
-    ungained = tuple(item for item in effects if not any(
-        hasattr(process, 'draw_gain') for process in item.processes(observation.model)))
+    key = tuple(effects)
+    alike: dict[float, list[int]] = {}
+    for a in chosen:
+        if (key, a) not in memory.shown:
+            speed = _speed(observation.acquisitions[a], observation.model)
+            alike.setdefault(speed, []).append(a)
+    for speed, some in alike.items():
+        setting = _setting(observation, speed, effects)
+        found = iter(setting.shown([item for a in some for item in pulses[a]]))
+        for a in some:
+            memory.keep((key, a), [
+                _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
+                for i, _ in enumerate(pulses[a])])
+        for amplitudes in setting.made:
+            memory.count(amplitudes)
+    shown = _together([[replace(item, index=item.index + n * lines.count)
+                        for item in memory.shown[key, a]] for n, a in enumerate(chosen)])
     noise = np.zeros(len(chosen) * lines.count)
     for item in shown:
         noise[item.index] = item.noise
     own = 2.0 * (unsteadiness**2 + RESOLUTION**2)  # half of it along the radius
-    return Expectation(shown, shown_by(ungained) if len(ungained) < len(effects) else shown,
-                       noise.reshape(len(chosen), -1) / level**2 + own)
+    steady = [item for item in effects if not any(
+        hasattr(process, 'draw_gain') for process in item.processes(observation.model))]
+    ungained = shown if len(steady) == len(effects) else expect(
+        observation, lines, level, steady, pulses, group, chosen, memory=memory).shown
+    return Expectation(shown, ungained, noise.reshape(len(chosen), -1) / level**2 + own)
 
 
 def _together(rows: Sequence[Sequence[_Shown]]) -> tuple[_Shown, ...]:
