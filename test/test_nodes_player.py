@@ -327,18 +327,23 @@ def test_diagnostics_contain_the_progress(bench, clock):
     assert values['seconds_sent'] == '0.100'
 
 
-def test_player_waits_for_subscribers(ros_graph, clock, tmp_path, recording):
-    write_npz(tmp_path / 'rig.npz', recording)
-    node = ros_graph.add(RecordingPlayer, {
-        'recording': str(tmp_path / 'rig.npz'), 'wait_seconds': 0.5})
-    node._tick()
-    assert 'waiting' in node.summary()[0]
+def waits_half_a_second(node, clock):
+    """Assert that a node that is to play from now on waits for subscribers before it does."""
     clock.now += 0.4
     node._tick()
     assert 'waiting' in node.summary()[0]
     clock.now += 0.2
     node._tick()
     assert 'playing' in node.summary()[0]
+
+
+def test_player_waits_for_subscribers(ros_graph, clock, tmp_path, recording):
+    write_npz(tmp_path / 'rig.npz', recording)
+    node = ros_graph.add(RecordingPlayer, {
+        'recording': str(tmp_path / 'rig.npz'), 'wait_seconds': 0.5})
+    node._tick()
+    assert 'waiting' in node.summary()[0]
+    waits_half_a_second(node, clock)
 
 
 def test_player_that_was_paused_waits_for_subscribers_when_it_is_to_play(
@@ -350,12 +355,7 @@ def test_player_that_was_paused_waits_for_subscribers_when_it_is_to_play(
     node._tick()
     assert 'paused' in node.summary()[0]
     node.set_parameters([Parameter('playing', value=True)])
-    clock.now += 0.4
-    node._tick()
-    assert 'waiting' in node.summary()[0]
-    clock.now += 0.2
-    node._tick()
-    assert 'playing' in node.summary()[0]
+    waits_half_a_second(node, clock)
 
 
 def test_pacer_follows_clock_and_rate_and_skips_a_lag():

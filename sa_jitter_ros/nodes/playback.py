@@ -144,11 +144,11 @@ class PlaybackNode(MonitoringNode):
 
     def apply(self, values: Values) -> None:
         """Apply changed values."""
-        if values['playing'] and not self._playing and self._stream is None:
-            self._stream = self.portions()  # the stream has ended: play it again
-            self.set_fault('stream', '')
         if values['playing'] and not self._playing:
             self._asked = time.monotonic()
+            if self._stream is None:
+                self._stream = self.portions()  # the stream has ended: play it again
+                self.set_fault('stream', '')
         self._playing = values['playing']
         self._timer.timer_period_ns = round(self._period(values['rate']) * 1e9)
         self._pacer.run(time.monotonic(), rate=values['rate'],

@@ -197,12 +197,15 @@ class ResidualAnalyser(MonitoringNode):
             return []
         self.set_missing('residual', '')
         ambiguous = sum(values is not None and not _resolved(values) for values in pulses)
-        self.set_missing('cause', '' if len(averages) - ambiguous >= _FEWEST else (
-            f'{ambiguous} of {len(averages)} averages have pulses whose error the vibration '
-            'leaves ambiguous, and tell no cause: declare stronger or lower orders in the '
-            'averager, or use a better keyphasor') if ambiguous else (
-            f'{len(averages)} averages at once tell no cause, at least {_FEWEST} do: raise '
-            'acquisitions'))
+        few = ''
+        if len(averages) < _FEWEST:
+            few = (f'{len(averages)} averages at once tell no cause, at least {_FEWEST} do: raise '
+                   'acquisitions')
+        elif len(averages) - ambiguous < _FEWEST:
+            few = (f'{ambiguous} of {len(averages)} averages have pulses whose error the '
+                   'vibration leaves ambiguous, and tell no cause: declare stronger or lower '
+                   'orders in the averager, or use a better keyphasor')
+        self.set_missing('cause', few)
         self._batch.averages.clear()
         self._batches += 1
         self._significant = found.p_surest < _SIGNIFICANT
