@@ -137,19 +137,20 @@ def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environm
 
 
 @pytest.mark.processes
-def test_demo_plays_a_wav_with_a_tach_channel_and_says_why_nothing_is_corrected(
-        process_environment, tmp_path, rng):
-    time = np.arange(round(RATE * SECONDS)) / RATE
-    both = np.stack((0.1 * rng.standard_normal(time.size), (SPEED * time % 1.0 < 0.1) - 0.5))
-    path = tmp_path / 'rig.wav'
-    wavfile.write(path, round(RATE), both.T.astype(np.float32))
-    done = run_demo(process_environment, str(path), '--tach-channel', '1', '--field', 'orders=1',
-                    '--output', str(tmp_path / 'out'))
+def test_a_measured_recording_in_a_wav_with_a_tach_channel_gives_averages_whose_loss_is_known(
+        shared_data, process_environment, tmp_path):
+    measured, path = read(shared_data / 'motor_30V_100kHz.npz'), tmp_path / 'rig.wav'
+    both = np.stack((measured.read()[0], measured.read_tach()), axis=1)
+    wavfile.write(path, round(measured.sample_rate), both.astype(np.float32))
+    done = run_demo(process_environment, str(path), '--tach-channel', '1', '--field',
+                    'pulses_per_revolution=8', '--output', str(tmp_path / 'out'))
     assert done.returncode == 0, done.stderr
     assert '1 channels' in done.stdout
-    assert re.search(r'^ +1 ', done.stdout, re.MULTILINE), done.stdout
-    assert re.search('note: the correction of [0-9]+ averages was refused: .*synchronous order',
-                     done.stdout), done.stdout
+    rows = [row for row in map(str.split, done.stdout.splitlines())
+            if row and re.fullmatch(r'\d+', row[0])]
+    attenuation = np.array([float(row[-5]) for row in rows])
+    assert len(rows) >= 5
+    np.testing.assert_allclose(attenuation, 1.0, atol=0.01, err_msg=done.stdout)
     with pytest.raises(RecordingError, match='--tach-channel'):
         plan_recording(path, read(path))
 
