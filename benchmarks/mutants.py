@@ -25,9 +25,10 @@ What noticed each is kept in `mutants.json` beside this file; the tests ask some
 import argparse
 import ast
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import compress
+from functools import cache
+from itertools import compress, islice
 import json
 from multiprocessing import Pool
 import os
@@ -81,22 +82,26 @@ def faults() -> Iterator[Fault]:
     """Yield every fault of `ROOMS`, of which each line can hold several."""
     for room in ROOMS:
         for path in sorted(Path(ROOT, 'sa_jitter_ros', room).glob('*.py')):
-            source = path.read_text()
-            lines = source.splitlines()
-            for top in ast.parse(source).body:
-                if isinstance(top, (ast.Import, ast.ImportFrom)):
-                    continue
-                constants = () if isinstance(
-                    top, (ast.FunctionDef, ast.ClassDef)) else tuple(
-                        item.id for item in ast.walk(top)
-                        if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store))
-                for node in ast.walk(top):
-                    found = _fault(node, lines)
-                    if found is not None:
-                        line, start, end, after = found
-                        text = lines[line - 1]
-                        yield Fault(str(path.relative_to(ROOT)), line, text, start, end,
-                                    text[start:end], after, constants)
+            yield from faults_of(str(path.relative_to(ROOT)))
+
+
+@cache
+def faults_of(path: str) -> tuple[Fault, ...]:
+    """Return the faults of a file, none if it is no longer there."""
+    found: list[Fault] = []
+    source = Path(ROOT, path).read_text() if Path(ROOT, path).exists() else ''
+    lines = source.splitlines()
+    for top in ast.parse(source).body:
+        if isinstance(top, (ast.Import, ast.ImportFrom)):
+            continue
+        constants = () if isinstance(top, (ast.FunctionDef, ast.ClassDef)) else tuple(
+            item.id for item in ast.walk(top)
+            if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store))
+        for place in filter(None, (_fault(node, lines) for node in ast.walk(top))):
+            line, start, end, after = place
+            text = lines[line - 1]
+            found.append(Fault(path, line, text, start, end, text[start:end], after, constants))
+    return tuple(found)
 
 
 def _fault(node: ast.AST, lines: Sequence[str]) -> tuple[int, int, int, str] | None:
@@ -216,10 +221,12 @@ def kept() -> list[Answer]:
 
 def sample(count: int, seed: int) -> list[tuple[Fault, str]]:
     """Draw faults that are still in the source and were noticed, and the test that did."""
-    now: Mapping[str, Fault] = {fault.name: fault for fault in faults()}
-    every = [(now[item['fault']], item['noticed']) for item in kept()
-             if item['noticed'] and item['fault'] in now]
-    return random.Random(seed).sample(every, min(count, len(every)))
+    answers = [item for item in kept() if item['noticed']]
+    random.Random(seed).shuffle(answers)
+    named = (({fault.name: fault for fault in faults_of(item['fault'].partition(':')[0])}, item)
+             for item in answers)
+    drawn = ((now[item['fault']], item['noticed']) for now, item in named if item['fault'] in now)
+    return list(islice(drawn, count))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,6 +12,7 @@
 
 import json
 
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -96,12 +97,14 @@ def test_machine_file_starts_every_node(name, written, recording, ros_graph):
 
 @pytest.mark.machines
 @pytest.mark.usefixtures('undrawn')
-def test_machine_file_declares_the_machine_to_the_commands(written, recording, capsys):
+def test_machine_file_declares_the_machine_to_the_commands(
+        written, recording, capsys, monkeypatch):
     machine = written / 'machine.yaml'
     declaration = read_declaration(machine)
     assert declaration.unknown == ()
     assert declaration.model.orders == (7.0, 14.0, 21.0)
     assert declaration.model.keyphasor_rate == pytest.approx(CLOCK, rel=0.05)
+    monkeypatch.setattr(design, 'draw', lambda *arguments: Figure())  # iso-lines take seconds
     assert design.main(['--params', str(machine), '--output', str(written / 'design.png')]) == 0
     assert close_loop.main([
         str(recording), '--field', 'vibration=acc', '--field', 'sample_rate=fs', '--field',
@@ -124,6 +127,7 @@ jitter_predictor:
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_machine_file_keeps_the_parts(recording, tmp_path, ros_graph):
     declared, found = tmp_path / 'declared.yaml', tmp_path / 'out' / 'machine.yaml'
     declared.write_text(PARTS)
@@ -145,6 +149,7 @@ def test_machine_file_keeps_the_parts(recording, tmp_path, ros_graph):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_machine_file_is_compared_with_what_is_found(recording, tmp_path):
     (tmp_path / 'machine.yaml').write_text(
         '/**/jitter_predictor:\n  ros__parameters:\n    pulses_per_revolution: 50\n'

@@ -155,15 +155,16 @@ def test_a_measured_recording_in_a_wav_with_a_tach_channel_gives_averages_whose_
         plan_recording(path, read(path))
 
 
-@pytest.mark.processes
-def test_unusable_recording_is_one_line_and_status_2(process_environment, tmp_path):
+def test_unusable_recording_is_one_line_and_status_2(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(demo, 'Watcher', None)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
     path = tmp_path / 'broken.npz'
     path.write_bytes(b'PK\x03\x04 and nothing else')
-    done = run_demo(process_environment, str(path))
-    assert done.returncode == 2
-    assert done.stdout == ''
-    assert len(done.stderr.splitlines()) == 1
-    assert str(path) in done.stderr
+    assert demo.main([str(path), '--output', str(tmp_path / 'out')]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert len(captured.err.splitlines()) == 1
+    assert str(path) in captured.err
 
 
 @pytest.mark.parametrize('place', ['file/out', 'file'])

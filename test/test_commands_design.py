@@ -10,12 +10,11 @@
 
 """The command `design`: its table, its figure, and one line for bad input."""
 
-import os
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 import re
 import shlex
-import subprocess
-import sys
 
 from matplotlib.figure import Figure
 import numpy as np
@@ -65,32 +64,35 @@ def test_the_table_is_what_the_library_chooses(tmp_path, capsys, name):
     assert output.read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.fixture(scope='module')
+def given(tmp_path_factory):
+    """Return what is printed and drawn of given settings."""
+    output, printed = tmp_path_factory.mktemp('given') / 'design.svg', StringIO()
+    with redirect_stdout(printed):
+        assert design.main([*BENCH, '--keyphasor-rate', '5000', '--trigger-cycles', '41',
+                            '--pulses-per-revolution', '6', '--output', str(output)]) == 0
+    return printed.getvalue(), output.read_text(encoding='utf-8')
+
+
 @pytest.mark.machines
-def test_given_settings_are_assessed(tmp_path, capsys):
-    output = tmp_path / 'design.svg'
-    assert design.main([*BENCH, '--keyphasor-rate', '5000', '--trigger-cycles', '41',
-                        '--pulses-per-revolution', '6', '--output', str(output)]) == 0
-    text = capsys.readouterr().out
+def test_given_settings_are_assessed(given):
+    text, svg = given
     assert settings(text) == (5000.0, 41)
     expected = designed(**KEYWORDS, keyphasor_rate=5000.0, trigger_cycles=41)
     np.testing.assert_allclose(rows(text)[:, 1], expected.loss, atol=6e-6)
     assert text.count('(given)') == 2
     assert text.count('exceeded') == 2
     assert '41 revolutions of the tach shaft, 0.988 s' in text
-    svg = output.read_text(encoding='utf-8')
     assert svg.count('<path') > 20
 
 
 @pytest.mark.machines
-def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, capsys):
-    sizes = []
-    for arguments in ([], ['--others', '18.6886', '--tones', '50', '1850', '--change', '-0.05',
-                           '--false-alarm-rate', '0.01']):
-        output = tmp_path / f'{len(arguments)}.svg'
-        assert design.main([*BENCH, '--loss', '0.03', '--variation', '0.005', *arguments,
-                            '--output', str(output)]) == 0
-        sizes.append(output.read_text(encoding='utf-8').count('<path'))
-    text = capsys.readouterr().out.split('figure:')[1]
+def test_interfering_components_and_detection_are_in_table_and_figure(given, tmp_path, capsys):
+    output = tmp_path / 'design.svg'
+    assert design.main([
+        *BENCH, '--loss', '0.03', '--variation', '0.005', '--others', '18.6886', '--tones', '50',
+        '1850', '--change', '-0.05', '--false-alarm-rate', '0.01', '--output', str(output)]) == 0
+    text = capsys.readouterr().out
     found = designed(**KEYWORDS, maximum_loss=0.03, maximum_variation=0.005, others=[18.6886],
                      tones=[50.0, 1850.0], change=-0.05, false_alarm_rate=0.01)
     assert settings(text) == (found.keyphasor_rate, found.trigger_cycles)
@@ -108,7 +110,7 @@ def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, 
     assert best.tolist() == leakage.best(5).tolist()
     np.testing.assert_allclose(shares, [leakage.largest_share[count - leakage.candidates[0]]
                                         for count in best.astype(int)], atol=6e-6)
-    assert sizes[1] > 1.3 * sizes[0]
+    assert output.read_text(encoding='utf-8').count('<path') > 1.3 * given[1].count('<path')
 
 
 @pytest.mark.usefixtures('no_figure')
@@ -166,11 +168,10 @@ def test_bad_input_is_one_line_and_status_2(capsys, arguments, message):
     assert error.startswith('design: ')
 
 
-@pytest.mark.machines
-def test_it_runs_as_a_process_and_explains_units(tmp_path):
-    result = subprocess.run(
-        [sys.executable, '-m', 'sa_jitter_ros.commands.design', '--help'], cwd=tmp_path,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, capture_output=True,
-        text=True, check=True)
+def test_its_help_explains_units(capsys):
+    with pytest.raises(SystemExit) as stop:
+        design.main(['--help'])
+    assert stop.value.code == 0
+    text = ' '.join(capsys.readouterr().out.split())
     for word in ('Hz', 'fraction', 'of components of amplitude 1', 'examples:'):
-        assert word in ' '.join(result.stdout.split())
+        assert word in text

@@ -112,7 +112,7 @@ def test_trace_with_effects_that_harm_can_not_be_made():
 
 
 @pytest.mark.machines
-@settings(max_examples=4, deadline=None, derandomize=True,
+@settings(max_examples=2, deadline=None, derandomize=True,
           suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 10_000), st.sampled_from([
     {}, {'excess_jitter': {'std': 1e-4}}, {'clock_skew': {'skew': 2e-4}},

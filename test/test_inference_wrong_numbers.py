@@ -77,11 +77,6 @@ def parameter(content, name):
     return item['parameters'][name]['value'], item['parameters'][name]['standard_error']
 
 
-@pytest.fixture(scope='module')
-def recording():
-    return machine(seconds=SECONDS)
-
-
 @pytest.mark.machines
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 def test_wrong_ratio_grows_with_the_angle_where_the_speed_changes(tmp_path):
@@ -130,8 +125,8 @@ def test_path_delay_does_not_depend_on_the_angle_that_all_lines_turn_by():
 
 
 @pytest.mark.machines
-def test_noise_below_the_declared_is_another_number_and_no_effect(recording):
-    content = told(recording, replace(MODEL, noise_std=2.0 * NOISE))
+def test_noise_below_the_declared_is_another_number_and_no_effect():
+    content = told(machine(seconds=SECONDS), replace(MODEL, noise_std=2.0 * NOISE))
     assert (content['verdict'], names(content)) == ('none', [])
     change, = content['declared_changes']
     assert (change['name'], change['parameter']) == ('noise', 'noise_std')
@@ -146,8 +141,8 @@ def test_noise_below_the_declared_is_another_number_and_no_effect(recording):
 
 
 @pytest.mark.machines
-def test_noise_above_the_declared_is_another_number_where_it_matters_little(recording):
-    content = told(recording, replace(MODEL, noise_std=0.9 * NOISE))
+def test_noise_above_the_declared_is_another_number_where_it_matters_little():
+    content = told(machine(swing=0.0, seconds=SECONDS), replace(MODEL, noise_std=0.9 * NOISE))
     assert content['verdict'] == 'none'
     assert [item['name'] for item in content['present']] == ['additive_noise']
     change, = content['declared_changes']
@@ -167,14 +162,14 @@ def test_period_of_a_declared_clock_need_not_be_declared():
 
 @pytest.mark.machines
 def test_beat_slower_than_an_average_is_that_of_an_interpolator():
-    content = told(machine(source_rate=RATE - 0.375))  # six beats, an average takes 1 s
+    content = told(machine(swing=0.0, source_rate=RATE - 0.375))  # six beats, an average takes 1 s
     assert names(content) == ['interpolation_loss']
     assert content['missing_effects'][0]['parameters']['method']['value'] == 'linear'
 
 
 @pytest.mark.machines
 def test_noise_that_is_declared_in_another_unit_ends_in_no_error():
-    content = told(machine(scale=1e-9))
+    content = told(machine(swing=0.0, scale=1e-9))
     assert content['verdict'] == 'none'
     change, = content['declared_changes']
     assert change['value'] == pytest.approx(1e-9 * NOISE, rel=0.05)

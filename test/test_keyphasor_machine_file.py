@@ -143,7 +143,7 @@ def test_jitter_that_is_not_declared_is_named_for_an_uneven_wheel(checked, tmp_p
         assert count == 1
         file.write_text(text)
 
-    folder = copytree(checked(80, edges=(*np.arange(12) / 12, 11.3 / 12), jitter=1.2e-4,
+    folder = copytree(checked(50, edges=(*np.arange(12) / 12, 11.3 / 12), jitter=1.2e-4,
                               orders=(1, 5, 8, 24)), tmp_path / 'rig')
     _, report = run_all(folder, capsys, change)
     effect, = report['missing_effects']
@@ -235,8 +235,8 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     """Other warnings than those for users, as numpy gives them, are errors in all tests."""
     path = shared_data / f'{name}.npz'
     recording = read(path, pulses_suffice=True, **fields)
-    if recording.samples * recording.channels > 1_000_000:  # all would be corrected
-        recording, path = cut(recording, 5.0, channels=2), tmp_path / path.name
+    if recording.samples * recording.channels > 200_000:  # all would be corrected
+        recording, path = cut(recording, 4.0, channels=1), tmp_path / path.name
         write_npz(path, recording)
     if name in KNOWN:
         check = keyphasor.check_keyphasor(replace(recording, pulses_per_revolution=1, orders=()))

@@ -88,7 +88,6 @@ LAWS = {
     'together': lambda rng, shape: lambda: 5.0 + 0.9 * rng.standard_normal(
         (shape[0], 1)) + 0.44 * rng.standard_normal(shape),
     'absent order': lambda rng, shape: lambda: rng.rayleigh(size=(5, *shape)).mean(axis=0),
-    'skewed': lambda rng, shape: lambda: rng.exponential(size=(5, *shape)).mean(axis=0),
     'unsteady': smooth,
 }
 
@@ -353,8 +352,7 @@ def test_absent_order_has_a_baseline_without_bias():
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('worse', [{'keyphasor': 2.0}, {'bias': 0.01},
-                                   {'keyphasor': 4.0, 'bias': 0.05}])
+@pytest.mark.parametrize('worse', [{'keyphasor': 2.0}, {'keyphasor': 4.0, 'bias': 0.05}])
 def test_worse_keyphasor_is_no_change_of_the_machine(worse):
     alarms = []
     for seed in range(3):
@@ -734,7 +732,7 @@ def test_exchanged_keyphasor_of_a_simulated_gear_is_no_change_and_damage_is():
     assert watch(rate=20e3, seed=1) == []
     assert monitor.is_complete
     # order 57 keeps a fifth of its amplitude in the raw average
-    assert watch(rate=2e3, seed=3) == []
+    assert watch(rate=2e3, seed=3, seconds=18.0) == []
     lines = watch(rate=2e3, seed=5, damaged=True)
     assert any(line.startswith('order 38 of input, channel 0: +') for line in lines)
     found = {item.name: item for item in monitor.changes()}

@@ -17,6 +17,7 @@ import subprocess
 import sys
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -180,10 +181,11 @@ def test_nodes_take_the_machine_file_of_a_wheel_with_an_extra_mark(ros_graph, tm
 
 @pytest.mark.machines
 @pytest.mark.usefixtures('undrawn')
-def test_commands_read_the_machine_file(capsys, tmp_path):
+def test_commands_read_the_machine_file(capsys, tmp_path, monkeypatch):
     declaration = read_declaration(MACHINE)
     assert declaration.unknown == ()
     assert declaration.model.orders == tuple(TRUE)
+    monkeypatch.setattr(design, 'draw', lambda *arguments: Figure())  # iso-lines take seconds
     assert design.main(['--params', str(MACHINE), '--output', str(tmp_path / 'a.png')]) == 0
     assert '57' in capsys.readouterr().out
     assert design.main(['--params', str(MACHINE), '--shaft', 'out']) == 2

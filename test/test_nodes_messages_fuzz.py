@@ -161,7 +161,7 @@ def test_no_message_ends_a_node(ros_graph, name):
     assert inputs.keys() <= callbacks.keys()
     stream = st.one_of([st.tuples(st.just(topic), kind) for topic, kind in inputs.items()])
 
-    @settings(max_examples=60)
+    @settings(max_examples=40)
     @given(st.lists(stream, max_size=8))
     def receive(sequence):
         for topic, message in sequence:

@@ -106,7 +106,7 @@ def test_any_parameters_are_refused_or_used(ros_graph, recording, name, monkeypa
         for key, value in sorted(node.parameters.values().items())]), max_size=3).map(dict)
     node.destroy_node()
 
-    @settings(max_examples=25)
+    @settings(max_examples=16)
     @given(some, st.lists(some, max_size=3))
     def use(first, later):
         try:

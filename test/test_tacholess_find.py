@@ -51,6 +51,14 @@ def run_up():
     return vibration, angle, sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=RANGE)
 
 
+@pytest.fixture(scope='module')
+def noisy():
+    """Return vibration, angle and found pulses of four machines in much noise."""
+    machines = [made(seed, noise=2.0, seconds=10.0) for seed in range(4)]
+    return [(vibration, angle, sa.find_pulses(
+        vibration, RATE, orders=ORDERS, speed_range=RANGE)) for vibration, angle in machines]
+
+
 @pytest.mark.machines
 def test_pulses_of_a_run_up(run_up):
     _, angle, found = run_up
@@ -66,12 +74,10 @@ def test_pulses_of_a_run_up(run_up):
 
 
 @pytest.mark.machines
-def test_errors_whitened_by_their_covariance_are_independent():
+def test_errors_whitened_by_their_covariance_are_independent(noisy):
     """Their sum of squares is that of the directions in which pulses err most."""
     squares = freedom = 0.0
-    for seed in range(4):
-        vibration, angle = made(seed, seconds=10.0)
-        found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=RANGE)
+    for _, angle, found in noisy:
         values, vectors = np.linalg.eigh(found.covariance)
         known = values > 0.3 * values.max()  # where nearly all of the variance is
         off = vectors.T[known] @ (error(found, angle) / found.speed)
@@ -95,15 +101,15 @@ def test_covariance_agrees_with_standard_errors_and_parts(run_up):
 
 
 @pytest.mark.machines
-def test_used_orders_are_too_large_and_others_too_small():
+def test_used_orders_are_too_large_and_others_too_small(noisy):
     """By as much as is expected: both are of the same averages, whose noise does not count."""
     rows = []
-    for seed in range(4):
-        vibration, _ = made(seed, noise=2.0, seconds=10.0)
+    for vibration, _, found in noisy:
         row = []
         for used in (True, False):
-            found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=RANGE,
-                                   hold_out=() if used else ORDERS[1:2])
+            if not used:
+                found = sa.find_pulses(vibration, RATE, orders=ORDERS, speed_range=RANGE,
+                                       hold_out=ORDERS[1:2])
             expected = found.expected(ORDERS, 60)
             assert expected.used.tolist() == [True, used, True]
             average = sa.average(vibration, RATE, found.times, orders=ORDERS, trigger_cycles=60,

@@ -44,7 +44,7 @@ class Effort:
 
 FULL = Effort(iterations=100_000, simulations=300, acquisitions=36, realisations=50,
               flights=4546)
-QUICK = Effort(iterations=3_000, simulations=2, acquisitions=3, realisations=2, flights=14)
+QUICK = Effort(iterations=3_000, simulations=2, acquisitions=3, realisations=2, flights=28)
 
 
 @dataclass(frozen=True)
