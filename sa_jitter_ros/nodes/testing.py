@@ -50,7 +50,7 @@ for _name in ('ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
 
 _DEPTH = 5000  # messages in the queue of a captured topic: none is lost in a test
 _AHEAD = 50  # messages that `publish` sends before it serves callbacks; inputs queue 200
-_IDLE_ROUNDS = 40  # rounds of one callback without a new message, after which all is settled
+_IDLE_ROUNDS = 12  # rounds of one callback without a new message, after which all is settled
 _DOMAINS = range(1, 101)  # ROS domains whose ports are outside the range of clients' ports
 
 
@@ -151,7 +151,7 @@ class Graph:
         assert self.spin(self._all_handled)
         idle, before = 0, self._arrived()
         while idle < _IDLE_ROUNDS:
-            self._executor.spin_once(timeout_sec=0.001)
+            self._executor.spin_once(timeout_sec=0.004)
             idle, before = (idle + 1 if before == self._arrived() else 0), self._arrived()
 
     def _all_handled(self) -> bool:
