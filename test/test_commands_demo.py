@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -153,6 +154,38 @@ def test_a_measured_recording_in_a_wav_with_a_tach_channel_gives_averages_whose_
     np.testing.assert_allclose(attenuation, 1.0, atol=0.01, err_msg=done.stdout)
     with pytest.raises(RecordingError, match='--tach-channel'):
         plan_recording(path, read(path))
+
+
+def test_an_averager_that_is_busy_is_waited_for(monkeypatch):
+    """On a loaded computer the first average may come long after the signals have ended."""
+    plan, now = plan_simulation(shipped('machine.yaml')), [0.0]
+    watcher = SimpleNamespace(
+        subscribe=lambda shafts: None, progress=lambda: '', predictions={plan.shaft: None},
+        count_subscribers=lambda topic: 1, count_publishers=lambda topic: 1,
+        averages=lambda: {plan.shaft: [{}] if now[0] > 20.0 else []},
+        status={plan.source: {'message': 'ended'}}, status_time={'synchronous_averager': 1.0})
+
+    def spin_once(timeout_sec):
+        now[0] += timeout_sec
+        watcher.status_time[plan.source] = now[0]
+        if now[0] > 20.0:
+            watcher.status_time['synchronous_averager'] = now[0]
+
+    monkeypatch.setattr(demo.time, 'monotonic', lambda: now[0])
+    monkeypatch.setattr(demo, 'AsyncParameterClient', lambda *arguments: SimpleNamespace(
+        services_are_ready=lambda: True, set_parameters=lambda parameters: None))
+    demo.watch(plan, watcher, SimpleNamespace(spin_once=spin_once), [])
+    assert 20.0 + demo.LAST_AVERAGE < now[0] < 20.0 + demo.LAST_AVERAGE + 5.0
+
+
+def test_a_refused_correction_is_noted(recording, monkeypatch, tmp_path, capsys):
+    plan = plan_recording(recording, read(recording))
+    monkeypatch.setattr(demo, 'write_results', lambda *arguments: '')
+    refused = {f'{plan.shaft}.corrections_refused': '3', f'{plan.shaft}.refusal': 'no order'}
+    demo.write_report(plan, SimpleNamespace(
+        averages=lambda: {plan.shaft: [{}]}, predictions={},
+        status={'synchronous_averager': refused}), tmp_path)
+    assert 'note: the correction of 3 averages was refused: no order\n' in capsys.readouterr().out
 
 
 def test_unusable_recording_is_one_line_and_status_2(monkeypatch, tmp_path, capsys):

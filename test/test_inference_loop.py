@@ -338,13 +338,17 @@ def test_declared_effect_that_is_not_there_is_named(name, declared, size):
 
 @pytest.mark.machines
 def test_declared_clock_that_did_not_time_the_pulses_is_named():
-    content = report(traced(declared=declared_effects(
-        {'keyphasor_quantisation': {'clock_rate': 2.93e3}})))
+    def of(rate):
+        declared = declared_effects({'keyphasor_quantisation': {'clock_rate': rate}})
+        return report(traced(declared=declared))
+
+    content = of(2.93e3)
     assert (content['verdict'], content['missing_effects']) == ('traced', [])
     changed, = content['declared_changes']
     assert (changed['name'], changed['parameter']) == ('keyphasor_quantisation', 'clock_rate')
     assert changed['value'] > 100.0 * RATE
     assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+    assert of(changed['value'])['verdict'] == 'none'
 
 
 @pytest.mark.machines

@@ -51,9 +51,9 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 # The timeouts end a demo that hangs; a busy computer needs tens of seconds to start the nodes.
 START_TIMEOUT = 120.0  # s until the nodes have found each other
-SILENCE_TIMEOUT = 60.0  # s without a status of the node that plays the signals
+SILENCE_TIMEOUT = 60.0  # s without a status of the node that plays, or of the one that averages
 STOP_TIMEOUT = 20.0  # s until a node has ended
-LAST_AVERAGE = 3.0  # s without a new average after the end of the signals
+LAST_AVERAGE = 3.0  # s after the last average in which the averager reports no other
 PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may contain thousands of pulses a second
 # Topics of a shaft, and those without which an average is not complete.
 RESULTS = ('synchronous_average', 'standard_error', 'order_amplitude', 'corrected_average',
@@ -233,8 +233,10 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
         ended = watcher.status.get(plan.source, {}).get('message', '').startswith('ended')
         if live and now - start > plan.seconds + LAST_AVERAGE:
             break
-        silence = now - watcher.status_time.get(plan.source, start)
-        if (ended and now - last > LAST_AVERAGE) or silence > SILENCE_TIMEOUT:
+        # an averager that is busy reports nothing
+        played, heard = (watcher.status_time.get(name, start)
+                         for name in (plan.source, 'synchronous_averager'))
+        if (ended and heard - last > LAST_AVERAGE) or now - min(played, heard) > SILENCE_TIMEOUT:
             break
 
 
