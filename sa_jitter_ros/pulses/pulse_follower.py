@@ -211,10 +211,10 @@ class PulseFollower:
             return False
         if self._is_of_clock():
             return True
-        steps, widths, _ = self._lock.lists
-        given = [max(item, self._options.tolerance) for item in self._lock.lists[2]]
+        _, widths, believed = self._lock.lists
+        given = [max(item, self._options.tolerance) for item in believed]
         rules = PathRules(
-            steps, widths, model.scatter, given, self._options.maximum_missing, model.expected,
+            widths, model.scatter, given, self._options.maximum_missing, model.expected,
             model.predictions, model.tick, model.degrees)
         paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent, using=model.chosen)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
@@ -267,8 +267,7 @@ class PulseFollower:
         count = len(marks)
         if count < 3 or not (marks[-1] and marks[-2]):
             return False
-        if any(path.marks[-2:] != marks[-2:] or path.slot != best.slot
-               or path.passed != best.passed for path in near):
+        if any(path.marks[-2:] != marks[-2:] or sum(path.marks) != sum(marks) for path in near):
             return False
         # Which of the pulses before is true makes no difference to these two.
         skipped = sum(marks[:-1])
@@ -408,18 +407,12 @@ class PulseFollower:
 
     def _slots_in(self, gap: float, level: float, slot: int) -> int:
         """Return how many slots a gap (s) from `slot` on has at a level, 0 if no whole one."""
-        _, widths, _ = self._lock.lists
-        turns, rest = divmod(gap / math.exp(level), sum(widths))
-        if not turns <= _LONGEST_GAP:  # nor NaN
+        ends = np.append(0.0, np.cumsum(np.roll(self._lock.widths, -slot)))
+        turns, rest = divmod(gap / math.exp(level), float(ends[-1]))
+        apart = np.abs(ends - rest)
+        if not (turns <= _LONGEST_GAP and apart.min() <= NEAR_WHOLE):  # nor NaN
             return 0
-        end, nearest, apart = 0.0, 0, rest
-        for number in range(1, len(widths) + 1):
-            end += widths[(slot + number - 1) % len(widths)]
-            if abs(end - rest) < apart:
-                nearest, apart = number, abs(end - rest)
-            if end > rest:
-                break
-        return int(turns) * len(widths) + nearest if apart <= NEAR_WHOLE else 0
+        return int(turns) * self._lock.widths.size + int(np.argmin(apart))
 
     @property
     def _room_of_marks(self) -> int:
