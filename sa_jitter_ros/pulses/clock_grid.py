@@ -49,10 +49,7 @@ def clock_tick(intervals: FloatArray, latest: float) -> float:
     if values.size < _FEWEST or np.count_nonzero(differ) + 1 > _DIFFERENT * values.size:
         return 0.0
     values = values[np.append(differ, True)]
-    steps = np.diff(values)
-    if not steps.size:
-        return 0.0
-    smallest = float(steps.min())
+    smallest = float(np.diff(values).min(initial=np.inf))
     if not smallest <= _LONGEST_TICK * float(np.median(intervals)):
         return 0.0
     for part in range(1, _PARTS + 1):

@@ -194,7 +194,9 @@ class PathRules:
 
     def _expected(self, recent: tuple[float, ...], using: int) -> list[_Prediction]:
         """Return cost, whether it slopes, expected level and number of the predictions."""
-        found, slows = [], _slows(recent)
+        found = []
+        slows = len(recent) > _SLOWED and all(
+            after > before for before, after in pairwise(recent[-1 - _SLOWED:]))
         for number, (cost, slopes, weights) in enumerate(self.predictions):
             size = len(weights)
             if size > len(recent):
@@ -234,12 +236,6 @@ class PathRules:
             given = math.expm1(level - self.expected)
         best = min(best, JUMP) if expected else 0.0
         return min(best, BELIEVED) if abs(given) <= self.given[path.slot] else best, off, using
-
-
-def _slows(recent: Sequence[float]) -> bool:
-    """Return whether the latest intervals were each longer than the one before."""
-    return len(recent) > _SLOWED and all(
-        after > before for before, after in pairwise(recent[-1 - _SLOWED:]))
 
 
 def slowing(level: float, before: float) -> list[float]:

@@ -310,8 +310,8 @@ class AngleCrossings:
         """Return the step of which nearly all steps of the angle are multiples, 0 if none is."""
         if self._steps.size < 16:
             return 0.0
-        differences = np.abs(np.subtract.outer(self._steps[-64:], self._steps[-64:]))
-        least = np.append(self._steps, differences[differences > 0.0])
+        latest = self._steps[-64:]
+        least = np.append(self._steps, np.abs(np.subtract.outer(latest, latest)))
         step = float(least[least > 1e-9].min(initial=np.inf))
         if not np.isfinite(step):
             return 0.0
