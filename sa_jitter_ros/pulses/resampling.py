@@ -33,6 +33,8 @@ from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.inner_loops import room, weighted_sums
 from scipy.special import i0
 
+_Places = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
+
 _SPLINE_POLE = np.sqrt(3.0) - 2.0
 # method: half-width of its kernel in samples
 _HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
@@ -219,8 +221,9 @@ def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction:
 
     As `interpolate`, for positions whose whole part is known, which must lie within the samples.
     """
-    return interpolate_along(samples, index, fraction, np.zeros(index.size), np.zeros(1),
-                             method=method, cutoff=cutoff)
+    ends = (int(index.min()), int(index.max())) if index.size else (0, 0)
+    return _weighted(samples, ends, (index, fraction, np.zeros(index.size), np.zeros(1)),
+                     _polynomials(_known(method), cutoff))
 
 
 def interpolate_along(samples: FloatArray, origin: NDArray[np.int32], begin: FloatArray,
@@ -232,13 +235,20 @@ def interpolate_along(samples: FloatArray, origin: NDArray[np.int32], begin: Flo
     As `interpolate`, for rows of positions, which must lie within the samples, and behind those of
     `origin`. Returns (row x u, channels), row by row.
     """
-    polynomials = _polynomials(_known(method), cutoff)
+    ends = origin + begin + length * np.array([[u.min()], [u.max()]])
+    return _weighted(samples, (math.floor(ends.min()) - 1, math.floor(ends.max()) + 1),  # rounding
+                     (origin, begin, length, u), _polynomials(_known(method), cutoff))
+
+
+def _weighted(samples: FloatArray, ends: tuple[int, int], places: _Places, polynomials: FloatArray
+              ) -> FloatArray:
+    """Return the weighted sums at places (origin, begin, length, u) between two samples."""
+    origin, begin, length, u = places
     values = room((origin.size * u.size, samples.shape[1]))
     if not values.size:
         return values
-    half, ends = polynomials.shape[1], origin + begin + length * np.array([[u.min()], [u.max()]])
-    first = math.floor(ends.min()) - half  # one more on either side for rounding
-    last = math.floor(ends.max()) + 1 + half
+    half = polynomials.shape[1]
+    first, last = ends[0] - half + 1, ends[1] + half
     window = samples[max(first, 0):last + 1]
     if first < 0 or last >= len(samples):
         window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
