@@ -28,6 +28,7 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len, rfft
+from scipy.special import softmax
 
 _MOST_VALUES = 3_000_000
 _MOST_POINTS = 600_000
@@ -270,13 +271,12 @@ def _fine(lines: ToothLines, ratio: float, strong: NDArray[np.intp]) -> float:
 
 
 def _normalised(log: dict[float, float], step: float) -> list[tuple[float, float]]:
-    top = max(log.values())
-    merged: list[list[float]] = []
+    merged: dict[float, float] = {}
     for ratio, value in sorted(log.items(), key=lambda item: -item[1]):
-        if not any(abs(ratio - kept[0]) < step for kept in merged):
-            merged.append([ratio, math.exp(max(value - top, -700.0))])
-    total = sum(item[1] for item in merged)
-    return [(ratio, weight / total) for ratio, weight in merged if weight / total > 1e-3][:6]
+        if all(abs(ratio - kept) >= step for kept in merged):
+            merged[ratio] = value
+    shares = softmax([*merged.values()]).tolist()
+    return [(ratio, share) for ratio, share in zip(merged, shares) if share > 1e-3][:6]
 
 
 def speed_ripples(samples: FloatArray, start: float, rate: float, fitted: FittedPulses) -> bool:

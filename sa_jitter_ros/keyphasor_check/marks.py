@@ -191,13 +191,12 @@ def _fitted(pulses: NumberedPulses, pattern: Marking, tick: float
             ) -> tuple[Marking, NumberedPulses]:
     """Return the pattern with its marks measured, and the pulses on it."""
     for _ in range(_ROUNDS):
-        on_mark = ~pattern.missing[pattern.tooth(pulses.numbers)]
-        pulses = pulses.only(on_mark) if not on_mark.all() else pulses
+        pulses = pulses.only(~pattern.missing[pattern.tooth(pulses.numbers)])
         if pattern.teeth > 1:
             pulses, pattern = _measured(pulses, pattern)
             pulses = _chosen_again(pulses, pattern)
-        kept = ~_outliers(pulses, pattern.late()[pattern.tooth(pulses.numbers)], tick)
-        pulses = pulses.only(kept) if not kept.all() else pulses
+        pulses = pulses.only(
+            ~_outliers(pulses, pattern.late()[pattern.tooth(pulses.numbers)], tick))
     if pattern.teeth > 1:
         pulses, pattern = _measured(pulses, pattern)
     return pattern, pulses

@@ -61,8 +61,7 @@ class NumberedPulses:
 
     def only(self, kept: BoolArray) -> 'NumberedPulses':
         """Return these pulses without those that are not `kept` (n,), which become strays."""
-        left = np.cumsum(kept)
-        breaks = np.unique([int(left[b - 1]) for b in self.breaks])
+        breaks = np.unique(np.cumsum(kept)[self.breaks - 1])
         return NumberedPulses(
             self.times[kept], self.numbers[kept], self.places[kept], self.pitch[kept],
             np.sort(np.append(self.strays, self.times[~kept])),

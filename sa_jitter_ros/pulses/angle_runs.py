@@ -283,7 +283,7 @@ class AngleRuns:
         if not new.size:
             return
         begins = np.flatnonzero(steps.begins[new])
-        for part in np.split(new, begins[begins > 0]) if begins.size else (new,):
+        for part in np.split(new, begins[begins > 0]):
             fresh = bool(steps.begins[part[0]]) or math.isnan(self._angle)
             step = steps.taken[part]
             step[0] = self._value[part[0]] if fresh else self._angle + step[0]
