@@ -75,11 +75,11 @@ class NumberedPulses:
 
     def unbroken(self) -> list['NumberedPulses']:
         """Return the parts between standstills."""
-        times, numbers, places, pitch = (np.split(each, self.breaks) for each in (
-            self.times, self.numbers, self.places, self.pitch))
-        strays = np.split(self.strays, np.searchsorted(self.strays, self.times[self.breaks]))
-        return [NumberedPulses(*part, np.empty(0, np.int64))
-                for part in zip(times, numbers, places, pitch, strays)]
+        begins = self.breaks
+        parts = zip(np.split(self.times, begins), np.split(self.numbers, begins),
+                    np.split(self.places, begins), np.split(self.pitch, begins),
+                    np.split(self.strays, np.searchsorted(self.strays, self.times[begins])))
+        return [NumberedPulses(*part, np.empty(0, np.int64)) for part in parts]
 
 
 def joined_parts(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
