@@ -78,14 +78,10 @@ def measure_jitter(true: FloatArray, numbers: NDArray[np.int64]) -> Jitter | Non
     scale = float(np.median(power / transfer)) or 1e-30
     (omega, transfer, power), count = _binned(np.stack((omega, transfer, power)))
 
-    def spectrum(parameters: FloatArray) -> FloatArray:
-        size, motion, memory = np.exp(parameters[0]), np.exp(parameters[1]), parameters[2]
-        r = math.tanh(memory)
-        errors = size * (1.0 - r**2) / (1.0 - 2.0 * r * np.cos(omega) + r**2)
-        return np.asarray(transfer * errors + motion)
-
     def deviance(parameters: FloatArray) -> float:
-        model = spectrum(parameters)
+        (size, motion), r = np.exp(parameters[:2]), math.tanh(parameters[2])
+        errors = size * (1.0 - r**2) / (1.0 - 2.0 * r * np.cos(omega) + r**2)
+        model = transfer * errors + motion
         return float(np.sum(count * (np.log(model) + power / scale / model)))
 
     from scipy import optimize  # which loads long, for programs that fit nothing

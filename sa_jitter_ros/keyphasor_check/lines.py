@@ -28,6 +28,7 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len, rfft
+from scipy.special import softmax
 
 _MOST_VALUES = 3_000_000
 _MOST_POINTS = 600_000
@@ -202,8 +203,7 @@ def _says(lines: ToothLines, family: list[int], count: int) -> tuple[float, bool
     places = lines.places[family] * count
     width = _WIDTH * lines.step
     on = np.abs(places - np.rint(places)) < width * count
-    chance = min(1.0, 2.0 * _WIDTH * lines.step * count)
-    one = np.where(on, math.log1p(_FOLLOWS / (1.0 - _FOLLOWS) / chance), 0.0)
+    one = np.where(on, _per_line(lines, 1.0 / count) - math.log(1.0 - _FOLLOWS), 0.0)
     weight = np.where(np.arange(one.size) == 0, 1.0, _MEMBER)
     whole = bool(np.all(np.abs(lines.places[family] - np.rint(lines.places[family])) < width))
     # Multiples of a line that is no multiple of 1/count are those of another shaft.
@@ -259,25 +259,24 @@ def _per_line(lines: ToothLines, ratio: float) -> float:
 
 def _fine(lines: ToothLines, ratio: float, strong: NDArray[np.intp]) -> float:
     """Return a ratio adjusted to the lines that are its multiples."""
+    places, sizes = lines.places[strong], lines.sizes[strong]
     for _ in range(3):
-        orders = np.rint(lines.places[strong] / ratio)
-        near = (np.abs(lines.places[strong] - orders * ratio) < 1.5 * lines.step) & (orders > 0)
+        orders = np.rint(places / ratio)
+        near = (np.abs(places - orders * ratio) < 1.5 * lines.step) & (orders > 0)
         if not near.any():
             break
-        g = orders[near] * np.sqrt(lines.sizes[strong][near])
-        ratio = float(g @ (lines.places[strong][near] * np.sqrt(lines.sizes[strong][near]))
-                      / (g @ g))
+        g = orders[near] * sizes[near]
+        ratio = float(g @ places[near] / (g @ orders[near]))
     return ratio
 
 
 def _normalised(log: dict[float, float], step: float) -> list[tuple[float, float]]:
-    top = max(log.values())
-    merged: list[list[float]] = []
+    merged: dict[float, float] = {}
     for ratio, value in sorted(log.items(), key=lambda item: -item[1]):
-        if not any(abs(ratio - kept[0]) < step for kept in merged):
-            merged.append([ratio, math.exp(max(value - top, -700.0))])
-    total = sum(item[1] for item in merged)
-    return [(ratio, weight / total) for ratio, weight in merged if weight / total > 1e-3][:6]
+        if all(abs(ratio - kept) >= step for kept in merged):
+            merged[ratio] = value
+    shares = softmax([*merged.values()]).tolist()
+    return [(ratio, share) for ratio, share in zip(merged, shares) if share > 1e-3][:6]
 
 
 def speed_ripples(samples: FloatArray, start: float, rate: float, fitted: FittedPulses) -> bool:

@@ -191,13 +191,12 @@ def _fitted(pulses: NumberedPulses, pattern: Marking, tick: float
             ) -> tuple[Marking, NumberedPulses]:
     """Return the pattern with its marks measured, and the pulses on it."""
     for _ in range(_ROUNDS):
-        on_mark = ~pattern.missing[pattern.tooth(pulses.numbers)]
-        pulses = pulses.only(on_mark) if not on_mark.all() else pulses
+        pulses = pulses.only(~pattern.missing[pattern.tooth(pulses.numbers)])
         if pattern.teeth > 1:
             pulses, pattern = _measured(pulses, pattern)
             pulses = _chosen_again(pulses, pattern)
-        kept = ~_outliers(pulses, pattern.late()[pattern.tooth(pulses.numbers)], tick)
-        pulses = pulses.only(kept) if not kept.all() else pulses
+        pulses = pulses.only(
+            ~_outliers(pulses, pattern.late()[pattern.tooth(pulses.numbers)], tick))
     if pattern.teeth > 1:
         pulses, pattern = _measured(pulses, pattern)
     return pattern, pulses
@@ -220,12 +219,12 @@ def _measured(pulses: NumberedPulses, pattern: Marking) -> tuple[NumberedPulses,
         return pulses, pattern
     scale = pattern.teeth / (2.0 * math.pi)
     pattern = replace(pattern, marks=found.angles * scale, errors=found.standard_errors * scale)
-    pitch = np.maximum(np.gradient(_smooth(pulses, pattern)), 1e-300)
+    _, pitch = _motion(pulses, pattern)
     return replace(pulses, pitch=pitch[pulses.numbers - pulses.numbers[0]]), pattern
 
 
-def _smooth(pulses: NumberedPulses, pattern: Marking) -> FloatArray:
-    """Return when the teeth from the first to the last number (m,) would pass if even, in s."""
+def _motion(pulses: NumberedPulses, pattern: Marking) -> tuple[FloatArray, FloatArray]:
+    """Return when teeth from the first number on (m,) would pass if even, and their pitch (s)."""
     true = pulses.times - pattern.late()[pattern.tooth(pulses.numbers)] * pulses.pitch
     return motion_of(true, pulses.numbers - pulses.numbers[0], pattern.teeth)
 
@@ -236,7 +235,7 @@ def _chosen_again(pulses: NumberedPulses, pattern: Marking) -> NumberedPulses:
     late = pattern.late()[pattern.tooth(grid)]
     marks = np.flatnonzero(~pattern.missing[pattern.tooth(grid)])
     pitch = np.interp(grid, pulses.numbers, pulses.pitch)
-    expected = np.maximum.accumulate((_smooth(pulses, pattern) + late * pitch)[marks])
+    expected = np.maximum.accumulate((_motion(pulses, pattern)[0] + late * pitch)[marks])
     every = np.sort(np.append(pulses.times, pulses.strays))
     after = np.clip(np.searchsorted(expected, every), 1, marks.size - 1)
     near = after - (every - expected[after - 1] < expected[after] - every)

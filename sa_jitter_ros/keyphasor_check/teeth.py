@@ -18,13 +18,10 @@ the next teeth stand, so that nothing depends on a single pulse and no error is 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
-from scipy.ndimage import rank_filter, uniform_filter1d
+from scipy.ndimage import convolve1d, rank_filter, uniform_filter1d
 
 #: Pulses from which on a target can be numbered; by which the count goes on behind a standstill.
 FEWEST, ACROSS = 6, 50
@@ -64,8 +61,7 @@ class NumberedPulses:
 
     def only(self, kept: BoolArray) -> 'NumberedPulses':
         """Return these pulses without those that are not `kept` (n,), which become strays."""
-        left = np.cumsum(kept)
-        breaks = np.unique([int(left[b - 1]) for b in self.breaks])
+        breaks = np.unique(np.cumsum(kept)[self.breaks - 1])
         return NumberedPulses(
             self.times[kept], self.numbers[kept], self.places[kept], self.pitch[kept],
             np.sort(np.append(self.strays, self.times[~kept])),
@@ -79,17 +75,11 @@ class NumberedPulses:
 
     def unbroken(self) -> list['NumberedPulses']:
         """Return the parts between standstills."""
-        edges = [0, *self.breaks.tolist(), self.times.size]
-        ends = [*self.times[self.breaks].tolist(), np.inf]
-        parts = []
-        for (start, stop), end in zip(pairwise(edges), ends):
-            part = slice(start, stop)
-            begin = self.times[start] if start else -np.inf
-            parts.append(NumberedPulses(
-                self.times[part], self.numbers[part], self.places[part], self.pitch[part],
-                self.strays[(self.strays >= begin) & (self.strays < end)],
-                np.empty(0, np.int64)))
-        return parts
+        begins = self.breaks
+        parts = zip(np.split(self.times, begins), np.split(self.numbers, begins),
+                    np.split(self.places, begins), np.split(self.pitch, begins),
+                    np.split(self.strays, np.searchsorted(self.strays, self.times[begins])))
+        return [NumberedPulses(*part, np.empty(0, np.int64)) for part in parts]
 
 
 def joined_parts(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
@@ -98,11 +88,11 @@ def joined_parts(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
     for part in parts[1:]:
         behind = int(numbers[-1][-1]) + ACROSS - int(part.numbers[0])
         numbers.append(part.numbers + teeth * -(-behind // teeth))
-    places, pitch, strays = (np.concatenate([getattr(part, name) for part in parts])
-                             for name in ('places', 'pitch', 'strays'))
+    times, places, pitch, strays = (np.concatenate([getattr(part, name) for part in parts])
+                                    for name in ('times', 'places', 'pitch', 'strays'))
     return NumberedPulses(
-        np.concatenate([part.times for part in parts]), np.concatenate(numbers), places, pitch,
-        strays, np.asarray(np.cumsum([part.times.size for part in parts[:-1]]), np.int64))
+        times, np.concatenate(numbers), places, pitch, strays,
+        np.asarray(np.cumsum([part.times.size for part in parts[:-1]]), np.int64))
 
 
 def number_pulses(times: FloatArray) -> NumberedPulses:
@@ -190,12 +180,9 @@ def _middle(intervals: FloatArray, window: int) -> FloatArray:
                  for rank in (-beside, beside))
     middle = uniform_filter1d(0.5 * (low + high), window, mode='mirror')
     if intervals.size >= 4 * window:  # where half the window is missing, the speed goes on
-        for inner, outer in ((slice(window, None, -1), slice(window, 2 * window + 1)),
-                             (slice(-window - 1, None), slice(-2 * window - 1, -window))):
-            slope = (middle[outer][-1] - middle[outer][0]) / window
-            steps = np.arange(window + 1)
-            middle[inner] = (middle[window] - slope * steps if outer.start > 0
-                             else middle[-window - 1] + slope * steps)
+        for side in (middle, middle[::-1]):
+            slope = (side[2 * window] - side[window]) / window
+            side[:window] = side[window] - slope * np.arange(window, 0, -1)
     return np.asarray(np.maximum(middle, np.max(intervals) * 1e-12))
 
 
@@ -211,7 +198,8 @@ def _places(times: FloatArray, pitch: FloatArray, silent: BoolArray, window: int
     first = 0
     for start, stop in zip(starts, stops):
         part = slice(start, stop)
-        mean = _smooth(np.exp(2j * np.pi * phase[part]), window)
+        mean = convolve1d(np.exp(2j * np.pi * phase[part]), np.bartlett(window + 2)[1:-1],
+                          mode='constant')
         teeth = phase[part] - np.unwrap(np.angle(mean)) / (2.0 * np.pi)
         count = np.rint(teeth - teeth[0])
         shift = float(np.median(teeth - count))
@@ -221,17 +209,9 @@ def _places(times: FloatArray, pitch: FloatArray, silent: BoolArray, window: int
     return numbers, places, np.asarray(starts[1:], np.int64)
 
 
-def _smooth(values: NDArray[Any], window: int) -> NDArray[Any]:
-    """Return the mean of complex values (n,) over neighbours with a triangular weight."""
-    half = window // 2
-    weight = 1.0 - np.abs(np.arange(-half, half + 1)) / (half + 1.0)
-    return np.asarray(np.convolve(values, weight)[half:half + values.size])
-
-
 def nearest_pulses(numbers: IntArray, away: FloatArray) -> BoolArray:
     """Return which pulses (n,), so far `away`, are nearest among those of the same number."""
     order = np.lexsort((away, numbers))
-    first = np.append(True, np.diff(numbers[order]) != 0)
     kept = np.zeros(numbers.size, np.bool_)
-    kept[order[first]] = True
+    kept[order[np.unique(numbers[order], return_index=True)[1]]] = True
     return kept

@@ -90,9 +90,8 @@ def number_marks(times: FloatArray) -> NumberedPulses | None:
     if np.all(np.abs(widths / np.median(widths) - steps) < _TOLERANCE):  # teeth, some missing
         numbers = numbers // marks * steps.sum() + (np.cumsum(steps) - steps)[numbers % marks]
         marks = int(steps.sum())
-    even = motion_of(accepted, numbers - numbers[0], marks)
-    own = even[numbers - numbers[0]]
-    pitch = np.maximum(np.gradient(even)[numbers - numbers[0]], 1e-300)
+    place = numbers - numbers[0]
+    own, pitch = (each[place] for each in motion_of(accepted, place, marks))
     return NumberedPulses(accepted, numbers, (accepted - own) / pitch, pitch,
                           np.setdiff1d(times, accepted), np.array(found.breaks, np.int64))
 

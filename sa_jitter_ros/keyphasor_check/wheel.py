@@ -19,7 +19,6 @@ repeats may also be a ripple of the speed with the revolution.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 import math
 
 import numpy as np
@@ -80,8 +79,7 @@ def patterns(pulses: NumberedPulses) -> list[Marking]:
 
     Only the first in a row of multiples is listed unless the multiple says more.
     """
-    part = _longest(pulses)
-    numbers, places = pulses.numbers[part], pulses.places[part]
+    numbers, places = _longest(pulses)
     span = int(numbers[-1] - numbers[0]) + 1
     most = min(_MOST_TEETH, span // _FEWEST_REVOLUTIONS)
     evidence = _Evidence(numbers, places)
@@ -112,8 +110,7 @@ def _once(pulses: NumberedPulses, pattern: Marking) -> Marking:
 
 def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Marking:
     """Return the pattern of a target of so many teeth, the errors of its marks not known yet."""
-    part = _longest(pulses)
-    numbers, places = pulses.numbers[part], pulses.places[part]
+    numbers, places = _longest(pulses)
     classes = numbers % teeth
     seen, span = _seen_of(numbers, teeth)
     missing = _missing(seen, span) | (seen == 0)
@@ -126,11 +123,10 @@ def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Mar
                    evidence)
 
 
-def _longest(pulses: NumberedPulses) -> slice:
-    """Return the longest part of the pulses without a standstill, of a bounded length."""
-    edges = [0, *pulses.breaks.tolist(), pulses.times.size]
-    start, stop = max(pairwise(edges), key=lambda edge: edge[1] - edge[0])
-    return slice(start, min(stop, start + _MOST_PULSES))
+def _longest(pulses: NumberedPulses) -> tuple[IntArray, FloatArray]:
+    """Return numbers and places of the longest part without a standstill, of a bounded length."""
+    part = max(pulses.unbroken(), key=lambda part: part.times.size)
+    return part.numbers[:_MOST_PULSES], part.places[:_MOST_PULSES]
 
 
 def _index(missing: BoolArray) -> int:

@@ -37,6 +37,7 @@ _TICK = 0.15  # of a turn, that a standing angle may move at once
 _TICKS = 3.0  # times the latest tick, likewise
 #: of the registers that overflow
 BITS = 8, 16, 32
+_BELOW = 0.0, 0.5, 1.0  # shares of their ranges that may lie below 0
 _ALIKE, _NEARLY_ALL = 0.02, 0.9  # of a count; share of the steps that are whole counts
 
 
@@ -55,7 +56,6 @@ class AngleRuns:
     :param turn: the angle of a revolution, in the unit of the samples.
     :param moduli: the angles after which the samples may wrap, also by several of them at once.
     :param registers: ranges of counters that may overflow, one at a time.
-    :param below: shares of these ranges that may lie below 0.
     :param counts: the samples are whole counts.
 
     `glitches` counts samples that were bridged, `jumps` the runs that began because the angle
@@ -70,11 +70,10 @@ class AngleRuns:
     """
 
     def __init__(self, turn: float, *, moduli: tuple[float, ...] = (),
-                 registers: tuple[float, ...] = (), below: tuple[float, ...] = (0.0,),
-                 counts: bool = False) -> None:
+                 registers: tuple[float, ...] = (), counts: bool = False) -> None:
         self.glitches = self.jumps = self.gaps = 0
         self.turn, self._quantum = turn, 1.0 if counts else 0.0
-        self._moduli, self._registers, self._below = moduli, registers, below
+        self._moduli, self._registers = moduli, registers
         self._tick = 0.0  # the latest step of an angle that stands between its steps
         self._time, self._value = np.empty(0), np.empty(0)
         self._forget()
@@ -173,7 +172,7 @@ class AngleRuns:
         for modulus in self._registers:
             other = step - np.copysign(modulus, step - expected)
             inside = np.any([(low >= -share * modulus) & (high <= (1.0 - share) * modulus)
-                             for share in self._below], axis=0)
+                             for share in _BELOW], axis=0)
             best = np.where(inside & (np.abs(other - expected) < np.abs(best - expected)),
                             other, best)
         return best
@@ -284,7 +283,7 @@ class AngleRuns:
         if not new.size:
             return
         begins = np.flatnonzero(steps.begins[new])
-        for part in np.split(new, begins[begins > 0]) if begins.size else (new,):
+        for part in np.split(new, begins[begins > 0]):
             fresh = bool(steps.begins[part[0]]) or math.isnan(self._angle)
             step = steps.taken[part]
             step[0] = self._value[part[0]] if fresh else self._angle + step[0]

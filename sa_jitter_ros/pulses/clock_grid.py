@@ -23,7 +23,7 @@ from sa_jitter_ros.arrays import FloatArray
 
 _FEWEST = 6  # intervals
 _DIFFERENT = 0.5  # most of the intervals that differ from all others
-LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick
+_LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick
 _WHOLE = 0.02  # ticks by which an interval may differ from a whole number of them
 _PARTS = 3  # of the smallest difference seen, that a tick may be
 _STAMP = 2.5e-9  # s, rounding of time stamps
@@ -49,11 +49,8 @@ def clock_tick(intervals: FloatArray, latest: float) -> float:
     if values.size < _FEWEST or np.count_nonzero(differ) + 1 > _DIFFERENT * values.size:
         return 0.0
     values = values[np.append(differ, True)]
-    steps = np.diff(values)
-    if not steps.size:
-        return 0.0
-    smallest = float(steps.min())
-    if not smallest <= LONGEST_TICK * float(np.median(intervals)):
+    smallest = float(np.diff(values).min(initial=np.inf))
+    if not smallest <= _LONGEST_TICK * float(np.median(intervals)):
         return 0.0
     for part in range(1, _PARTS + 1):
         tick = smallest / part

@@ -174,7 +174,11 @@ class KeyphasorDetector:
         window = max(round(self._learning_time * sample_rate), 8) if self._learns else block.size
         while block.size:
             piece, block = np.split(block, [window - sum(part.size for *_, part in self._window)])
-            found.append(self._take((self._origin, self._index, self._sign * piece)))
+            part = self._origin, self._index, self._sign * piece
+            if self._learns:
+                self._window.append(part)
+            if self._levels or not self._learns:
+                found.append(self._detect(part))
             self._index += piece.size
             if sum(part.size for *_, part in self._window) == window:
                 found.append(self._learn())
@@ -204,12 +208,6 @@ class KeyphasorDetector:
             raise SignalError(f'sample {bad} of the block is {given[bad]}: samples must be '
                               'finite; leave the block out, which makes a gap')
         return block
-
-    def _take(self, piece: Piece) -> FloatArray:
-        """Keep a piece for learning; return the pulses in it if the levels are known."""
-        if self._learns:
-            self._window.append(piece)
-        return self._detect(piece) if self._levels or not self._learns else _NONE
 
     def _learn(self) -> FloatArray:
         """Learn the levels from a full window; return its pulses if they waited for the levels."""

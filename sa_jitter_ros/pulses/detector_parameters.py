@@ -33,7 +33,6 @@ DETECTOR_PARAMETERS = (
               'waveform]', minimum=0.0),
 )
 
-# Parameters that are options of the detector, and all that decide which pulses it finds.
-OPTIONS = ('hysteresis', 'polarity', 'edge', 'interpolate', 'minimum_interval', 'learning_time',
-           'minimum_difference')
-DECISIVE = ('automatic_threshold', 'threshold', *OPTIONS)
+# All decide which pulses a detector finds; those behind the threshold are its options.
+DECISIVE = tuple(item.name for item in DETECTOR_PARAMETERS)
+OPTIONS = DECISIVE[2:]

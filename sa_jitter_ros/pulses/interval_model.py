@@ -27,7 +27,7 @@ from operator import mul
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
-from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
+from sa_jitter_ros.pulses.clock_grid import clock_tick
 from sa_jitter_ros.pulses.pulse_chain import robust_square
 from sa_jitter_ros.pulses.pulse_paths import LevelPrediction, OTHER, REACH
 
@@ -186,20 +186,18 @@ class IntervalModel:
 
         They are from mark to mark, of relative `widths` (n,), and end at the time `latest` (s).
         """
-        if self.given:
-            return False
         length = math.exp(self.expected)
-        if np.any(np.abs(intervals / length - widths) > 2.0 * LONGEST_TICK):
-            return False
         tick = clock_tick(np.array([*self._intervals, *intervals]), latest) / length
         if tick <= self.tick:
             return False
         # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
         lone = not clock_tick(np.array(self._intervals), latest)
-        opposite = _is_displacement(intervals / length - widths)
+        off = intervals / length - widths  # a displaced pulse: one is longer, the other shorter
+        opposite = abs(off.sum()) < _OPPOSITE * np.abs(off).max()
         if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
-            known, self._lone = self._lone, (latest, tick * length)
-            if opposite or not _is_repeated(known, self._lone, least=length):
+            (seen, size), self._lone = self._lone, (latest, tick * length)
+            if opposite or latest - seen <= _APART * length or (
+                    abs(tick * length - size) >= _AS_LARGE * tick * length):
                 return False
         before, self.tick, self._latest = self.tolerance, tick, latest
         self._set_tolerance()
@@ -239,16 +237,6 @@ class IntervalModel:
         self.harmless = min(widest, self._harmless, self.tolerance)
         #: pulses nearer to each other are of one mark
         self.same = min(widest, self._same, self.tolerance)
-
-
-def _is_displacement(deviations: FloatArray) -> bool:
-    """Tell whether of these intervals (n,) one is longer by as much as another is shorter."""
-    return bool(abs(deviations.sum()) < _OPPOSITE * np.abs(deviations).max())
-
-
-def _is_repeated(step: tuple[float, float], other: tuple[float, float], *, least: float) -> bool:
-    """Tell whether of two steps (time, size in s) the other is later and as large."""
-    return other[0] - step[0] > _APART * least and abs(other[1] - step[1]) < _AS_LARGE * other[1]
 
 
 def _expected(weights: tuple[float, ...], levels: list[float], place: int) -> float:

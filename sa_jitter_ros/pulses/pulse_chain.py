@@ -118,7 +118,7 @@ def _most_likely(pulses: FloatArray, scatter: float | None, stray: float, limit:
     """
     best, cheapest = None, math.inf
     for tried in reversed(_LADDER if scatter is None else (*_LADDER, scatter)):
-        rules = PathRules((1,), (1.0,), tried, (0.0,), 1, None, stray=stray, each=_each(tried),
+        rules = PathRules((1.0,), tried, (0.0,), 1, None, stray=stray, each=_each(tried),
                           most=_MOST_PATHS)
         paths: list[Path] = []
         for number, pulse in enumerate(pulses.tolist()):

@@ -160,11 +160,10 @@ class PulseFollower:
             if size == 1:
                 self._look_at_turns(levels)
             self._recent.extend(taken)
-            self._note(slots, levels, taken)
             self.slot = (slots[-1] + 1) % size
             self.confirmed = taken[-1]
+            self._note(slots, levels, taken)
             del self._queue[:count]
-            self._learn_marks()
         return count
 
     def _look_at_turns(self, levels: list[float]) -> None:
@@ -187,11 +186,19 @@ class PulseFollower:
             'does the same')
 
     def _note(self, slots: list[int], levels: list[float], times: list[float]) -> None:
-        """Note the intervals behind these slots, and when they end, for the pattern."""
-        if self._lock.steps.size > 1:
-            self.marks += slots
-            self.levels += levels
-            self.times += times
+        """Note the intervals behind these slots and when they end; learn the marks from many."""
+        lock = self._lock
+        if lock.steps.size == 1:
+            return
+        self.marks += slots
+        self.levels += levels
+        self.times += times
+        if self._room_of_marks <= 0:
+            self._lock = lock.with_pattern(
+                mark_pattern(np.array(self.marks, np.int64), np.array(self.levels),
+                             lock.steps.size), weight=1.0 / min(2 + self._learnt, 8))
+            self._learnt += 1
+            self.marks, self.levels, self.times = [], [], []
 
     # --- doubtful pulses ---
 
@@ -211,10 +218,10 @@ class PulseFollower:
             return False
         if self._is_of_clock():
             return True
-        steps, widths, _ = self._lock.lists
-        given = [max(item, self._options.tolerance) for item in self._lock.lists[2]]
+        _, widths, believed = self._lock.lists
+        given = [max(item, self._options.tolerance) for item in believed]
         rules = PathRules(
-            steps, widths, model.scatter, given, self._options.maximum_missing, model.expected,
+            widths, model.scatter, given, self._options.maximum_missing, model.expected,
             model.predictions, model.tick, model.degrees)
         paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent, using=model.chosen)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
@@ -257,7 +264,7 @@ class PulseFollower:
                 return True
             if first.mark == 1 and (abs(first.off) <= self._tolerance or (
                     self._model.unsteady and not first.jumps)):
-                self._accept(1, first.level)
+                self._accept(first.level)
                 return True
             later = [step.level for step in best.steps[1:] if step.mark]
             if not later and not final:
@@ -267,8 +274,7 @@ class PulseFollower:
         count = len(marks)
         if count < 3 or not (marks[-1] and marks[-2]):
             return False
-        if any(path.marks[-2:] != marks[-2:] or path.slot != best.slot
-               or path.passed != best.passed for path in near):
+        if any(path.marks[-2:] != marks[-2:] or sum(path.marks) != sum(marks) for path in near):
             return False
         # Which of the pulses before is true makes no difference to these two.
         skipped = sum(marks[:-1])
@@ -293,9 +299,9 @@ class PulseFollower:
             self._verdicts.counts['relearnt'] += 1
             self.lost = True
 
-    def _accept(self, mark: int, level: float) -> None:
-        """Accept the first waiting pulse, `mark` slots after the last one."""
-        slots, steps = self._passed(mark)
+    def _accept(self, level: float) -> None:
+        """Accept the first waiting pulse, one slot after the last one."""
+        slots, steps = self._passed(1)
         pulse = self._next(slots, level)
         self._model.accept([level])
         self._lacking = []
@@ -397,29 +403,22 @@ class PulseFollower:
         self._recent.append(pulse)
         self._verdicts.counts['accepted'] += 1
         self.confirmed = pulse
+        self.slot = (slots[-1] + 1) % self._lock.steps.size
         if len(slots) > self._lock.steps.size:  # a gap of more than a revolution
             self.marks, self.levels, self.times = [], [], []
         else:
             self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
                        [pulse] * len(slots))
-        self.slot = (slots[-1] + 1) % self._lock.steps.size
-        self._learn_marks()
         return pulse
 
     def _slots_in(self, gap: float, level: float, slot: int) -> int:
         """Return how many slots a gap (s) from `slot` on has at a level, 0 if no whole one."""
-        _, widths, _ = self._lock.lists
-        turns, rest = divmod(gap / math.exp(level), sum(widths))
-        if not turns <= _LONGEST_GAP:  # nor NaN
+        ends = np.append(0.0, np.cumsum(np.roll(self._lock.widths, -slot)))
+        turns, rest = divmod(gap / math.exp(level), float(ends[-1]))
+        apart = np.abs(ends - rest)
+        if not (turns <= _LONGEST_GAP and apart.min() <= NEAR_WHOLE):  # nor NaN
             return 0
-        end, nearest, apart = 0.0, 0, rest
-        for number in range(1, len(widths) + 1):
-            end += widths[(slot + number - 1) % len(widths)]
-            if abs(end - rest) < apart:
-                nearest, apart = number, abs(end - rest)
-            if end > rest:
-                break
-        return int(turns) * len(widths) + nearest if apart <= NEAR_WHOLE else 0
+        return int(turns) * self._lock.widths.size + int(np.argmin(apart))
 
     @property
     def _room_of_marks(self) -> int:
@@ -428,15 +427,3 @@ class PulseFollower:
         if size == 1 or self._probe:
             return _NEVER
         return REVOLUTIONS * size + 1 - len(self.levels)
-
-    def _learn_marks(self) -> None:
-        """Learn the angles between the marks from the latest revolutions."""
-        lock = self._lock
-        size = lock.steps.size
-        if self._room_of_marks > 0:
-            return
-        self._lock = lock.with_pattern(
-            mark_pattern(np.array(self.marks, np.int64), np.array(self.levels), size),
-            weight=1.0 / min(2 + self._learnt, 8))
-        self._learnt += 1
-        self.marks, self.levels, self.times = [], [], []

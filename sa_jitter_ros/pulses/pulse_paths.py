@@ -83,15 +83,14 @@ class Path(NamedTuple):
     """
     An explanation: its `cost`, and a step for each pulse.
 
-    `last` (s) is the last true pulse, at `slot` and `passed` teeth from where the path began,
-    `recent` are the levels of the last intervals. With `jumped` the speed is no longer that of
-    earlier intervals. The prediction number `using` is used. `stray_at` (s) is the latest stray.
+    `last` (s) is the last true pulse, at `slot`, `recent` are the levels of the last intervals.
+    With `jumped` the speed is no longer that of earlier intervals. The prediction number `using`
+    is used. `stray_at` (s) is the latest stray.
     """
 
     cost: float
     last: float
     slot: int
-    passed: int = 0
     recent: tuple[float, ...] = ()
     using: int = 0
     jumped: bool = False
@@ -109,15 +108,14 @@ class PathRules:
     """
     What decides about paths.
 
-    `steps` (slot,) are the teeth from each slot to the next, `widths` (slot,) the same with what
-    is known of uneven marks. `scatter` is that of the intervals, relative to 1; deviations within
-    `given` (slot,) are believed. Up to `maximum_missing` pulses may be missing. `expected` is the
+    `widths` (slot,) are the teeth from each slot to the next, with what is known of uneven marks.
+    `scatter` is that of the intervals, relative to 1; deviations within `given` (slot,) are
+    believed. Up to `maximum_missing` pulses may be missing. `expected` is the
     level that earlier intervals predict (None: not known), and the clock moves a pulse by up to a
     `tick` of the interval. As many intervals as `degrees` show the scatter (Student's t: of a few,
     it may be too small). A stray costs `stray`, any interval `each`; `most` paths are kept.
     """
 
-    steps: Sequence[int]
     widths: Sequence[float]
     scatter: float
     given: Sequence[float]
@@ -136,9 +134,9 @@ class PathRules:
         predicted: dict[tuple[tuple[float, ...], int], list[_Prediction]] = {}
         for path in paths:
             if path.cost + self.stray <= limit:
-                _, last, slot, passed, recent, using, jumped, steps, _ = path
-                found.append(Path(path.cost + self.stray, last, slot, passed, recent, using,
-                                  jumped, (*steps, _STRAY), pulse))
+                _, last, slot, recent, using, jumped, steps, _ = path
+                found.append(Path(path.cost + self.stray, last, slot, recent, using, jumped,
+                                  (*steps, _STRAY), pulse))
             if pulse > path.last and path.cost + self.each <= limit:
                 # Paths that differ in strays only expect the same.
                 known = path.recent, path.using
@@ -155,15 +153,14 @@ class PathRules:
     def _true(self, path: Path, pulse: float, limit: float, expected: list[_Prediction]
               ) -> list[Path]:
         """Return paths on which the next pulse (s) is true: those that cost up to `limit`."""
-        before, last, slot, passed, recent, chosen, jumped, steps, stray_at = path
+        before, last, slot, recent, chosen, jumped, steps, stray_at = path
         gap, width = pulse - last, 0.0
         found = []
         for mark in range(1, 2 + self.maximum_missing):
             if mark > 1 and before + MISSING + MORE_MISSING * (mark - 2) + self.each > limit:
                 break
             width += self.widths[slot]
-            passed += self.steps[slot]
-            slot = (slot + 1) % len(self.steps)
+            slot = (slot + 1) % len(self.widths)
             level = math.log(gap / width)
             cost, off, using = self._deviation(path, expected, level, mark)
             jumps = cost == JUMP
@@ -174,13 +171,12 @@ class PathRules:
                 taken = (*steps, Step(mark, level, off, jumps))
                 if jumps:  # of the angle, and the speed stays as it was; or of the speed
                     found += [
-                        Path(total, pulse, slot, passed, recent, chosen, jumped, taken, stray_at),
-                        Path(total + (FRACTION if is_multiple(off) else 0.0), pulse, slot, passed,
+                        Path(total, pulse, slot, recent, chosen, jumped, taken, stray_at),
+                        Path(total + (FRACTION if is_multiple(off) else 0.0), pulse, slot,
                              (*recent[-1:], level), chosen, True, taken, stray_at)]
                 else:
-                    found.append(Path(total, pulse, slot, passed,
-                                      (*recent, *(level,) * mark)[-REACH:], using, jumped, taken,
-                                      stray_at))
+                    found.append(Path(total, pulse, slot, (*recent, *(level,) * mark)[-REACH:],
+                                      using, jumped, taken, stray_at))
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
         return found
@@ -198,7 +194,9 @@ class PathRules:
 
     def _expected(self, recent: tuple[float, ...], using: int) -> list[_Prediction]:
         """Return cost, whether it slopes, expected level and number of the predictions."""
-        found, slows = [], _slows(recent)
+        found = []
+        slows = len(recent) > _SLOWED and all(
+            after > before for before, after in pairwise(recent[-1 - _SLOWED:]))
         for number, (cost, slopes, weights) in enumerate(self.predictions):
             size = len(weights)
             if size > len(recent):
@@ -238,12 +236,6 @@ class PathRules:
             given = math.expm1(level - self.expected)
         best = min(best, JUMP) if expected else 0.0
         return min(best, BELIEVED) if abs(given) <= self.given[path.slot] else best, off, using
-
-
-def _slows(recent: Sequence[float]) -> bool:
-    """Return whether the latest intervals were each longer than the one before."""
-    return len(recent) > _SLOWED and all(
-        after > before for before, after in pairwise(recent[-1 - _SLOWED:]))
 
 
 def slowing(level: float, before: float) -> list[float]:

@@ -278,29 +278,25 @@ class AngleCrossings:
         share = (marks - low) / np.where(high > low, high - low, 1.0)
         straight = self._time[index - 1] + np.clip(share, 0.0, 1.0) * (
             self._time[index] - self._time[index - 1])
-        whole = (index >= _BEFORE) & (index + _AFTER <= reached.size) & (not self._counted)
-        if whole.any():
-            straight[whole] = self._fitted(index[whole], marks[whole], turned, straight[whole])
+        fitted = np.flatnonzero(
+            (index >= _BEFORE) & (index + _AFTER <= reached.size) & (not self._counted))
+        around = index[fitted, None] + np.arange(-_BEFORE, _AFTER)
+        moving = np.all(np.diff(turned[around], axis=1) > 0.0, axis=1)
+        if moving.any():
+            at = fitted[moving]
+            straight[at] += self._beside(around[moving], marks[at], turned, straight[at])
         return np.asarray(np.maximum.accumulate(straight))
 
-    def _fitted(self, index: Array, marks: FloatArray, turned: FloatArray,
-                straight: FloatArray) -> FloatArray:
-        """Return the times of marks by a parabola through the samples around each."""
-        around = index[:, None] + np.arange(-_BEFORE, _AFTER)
+    def _beside(self, around: Array, marks: FloatArray, turned: FloatArray, origin: FloatArray
+                ) -> FloatArray:
+        """Return times of marks behind `origin` (s): parabolas through the samples `around`."""
         span = turned[around[:, -1]] - turned[around[:, 0]]
-        moving = np.all(np.diff(turned[around], axis=1) > 0.0, axis=1)
-        result = straight.copy()
-        if not moving.any():
-            return result
-        around, marks, span = around[moving], marks[moving], span[moving]
-        origin = straight[moving]
         x = (turned[around] - marks[:, None]) / span[:, None]
         y = self._time[around] - origin[:, None]
         powers = np.stack([np.ones_like(x), x, x**2], axis=2)
         inverse = np.linalg.pinv(powers)  # (crossing, power, sample)
         factors = np.einsum('ips,is->ip', inverse, y)
         left = y - np.einsum('isp,ip->is', powers, factors)
-        result[moving] = origin + factors[:, 0]
         latest = np.column_stack((  # leverage, and s a rad
             np.sum(inverse[:, 0] ** 2, axis=1), (y[:, -1] - y[:, 0]) / span))
         free = _BEFORE + _AFTER - 3
@@ -308,14 +304,14 @@ class AngleCrossings:
             self._left = _MEMORY * self._left + float(rest @ rest)
             self._freedom = _MEMORY * self._freedom + free
             self._leverage_slowness += free / self._freedom * (each - self._leverage_slowness)
-        return result
+        return np.asarray(factors[:, 0])
 
     def _resolution(self) -> float:
         """Return the step of which nearly all steps of the angle are multiples, 0 if none is."""
         if self._steps.size < 16:
             return 0.0
-        differences = np.abs(np.subtract.outer(self._steps[-64:], self._steps[-64:]))
-        least = np.append(self._steps, differences[differences > 0.0])
+        latest = self._steps[-64:]
+        least = np.append(self._steps, np.abs(np.subtract.outer(latest, latest)))
         step = float(least[least > 1e-9].min(initial=np.inf))
         if not np.isfinite(step):
             return 0.0
@@ -333,8 +329,6 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
     if not counts.size:
         return AngleRuns(turn, counts=True)
     size = np.quantile(np.abs(counts), _USUALLY)
-    low, high = np.quantile(counts, (1.0 - _USUALLY, _USUALLY))
-    below = (0.0,) if low >= 0.0 else (1.0,) if high <= 0.0 else (0.0, 0.5, 1.0)
     registers = [each for each in (turn, *(2.0**bits for bits in BITS))
                  if each >= max(size, _LEAST_MODULUS)]
     steps = np.diff(counts)
@@ -349,7 +343,7 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
                 span <= each <= span + usual for each in registers):
             registers.append(span)
     return AngleRuns(turn, moduli=(modulus,) if modulus else (), registers=tuple(registers),
-                     below=below, counts=True)
+                     counts=True)
 
 
 def _of_counter(counts: FloatArray, marks: int, modulus: float = 0.0) -> AngleCrossings:

@@ -102,8 +102,7 @@ def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, cou
     late = np.zeros(teeth.size)  # in teeth
     pitch: FloatArray = np.full(place[-1] + 1, (times[-1] - times[0]) / place[-1])
     for _ in range(_ROUNDS):
-        smooth = motion_of(times - late[index] * pitch[place], place, count)
-        pitch = np.maximum(np.gradient(smooth), 1e-300)
+        smooth, pitch = motion_of(times - late[index] * pitch[place], place, count)
         table = np.full((int(turns[-1]) + 1, teeth.size), np.nan)
         table[turns, index] = (times - smooth[place]) / pitch[place]
         table = table[1:-1]  # the speed of the first and the last one is known less
@@ -117,18 +116,20 @@ def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, cou
     return MarkOffsets(late * scale, _standard_errors(table) * scale, float(seen.mean()))
 
 
-def motion_of(times: FloatArray, place: IntArray, count: int) -> FloatArray:
+def motion_of(times: FloatArray, place: IntArray, count: int
+              ) -> tuple[FloatArray, FloatArray]:
     """
-    Return when teeth 0, 1, ... (m,) of an even target would pass, in s.
+    Return when teeth 0, 1, ... (m,) of an even target would pass, and the pitch there, in s.
 
-    It follows from the `times` (n,) in s at which the teeth `place` (n,), of which 0 is the first,
-    passed. Means over revolutions of `count` teeth, and of what they miss of a bent motion, see no
-    pattern of the target.
+    They follow from the `times` (n,) in s at which the teeth `place` (n,), of which 0 is the
+    first, passed. Means over revolutions of `count` teeth, and of what they miss of a bent motion,
+    see no pattern of the target.
     """
     grid = np.arange(place[-1] + 1)
     straight = np.linspace(times[0], times[-1], grid.size)
     once = _over_revolution(np.interp(grid, place, times) - straight, count)
-    return np.asarray(2.0 * once - _over_revolution(once, count) + straight)
+    smooth = np.asarray(2.0 * once - _over_revolution(once, count) + straight)
+    return smooth, np.maximum(np.gradient(smooth), 1e-300)
 
 
 def combined(before: MarkOffsets, latest: MarkOffsets, most: float) -> MarkOffsets:

@@ -177,15 +177,12 @@ class PulseValidator:
         self.pulses_per_revolution, self.pulses_per_trigger = teeth, per_trigger
         self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
-        self._out_of_order = self._restarts = self._non_finite = 0
 
     @property
     def counts(self) -> PulseCounts:
         """Return the counts so far."""
         return PulseCounts(
-            **self._judge.verdicts.counts, out_of_order=self._out_of_order,
-            restarts=self._restarts, non_finite=self._non_finite,
-            cycles_discarded=self._counter.discarded,
+            **self._judge.verdicts.counts, cycles_discarded=self._counter.discarded,
             geometry_refused=0 if self._corrector is None else self._corrector.refused)
 
     @property
@@ -237,7 +234,7 @@ class PulseValidator:
                               'give real numbers, (n,)')
         pulses = given.astype(np.float64)
         finite = np.isfinite(pulses)
-        self._non_finite += int(np.count_nonzero(~finite))
+        self._judge.verdicts.counts['non_finite'] += int(np.count_nonzero(~finite))
         pulses = pulses[finite] - self._path_delay
         while pulses.size:
             piece, ahead = pulses[:1 if self._held else _PIECE].tolist(), 0
@@ -263,19 +260,17 @@ class PulseValidator:
         return self._sink.flush()
 
     def _take(self, pulse: float) -> None:
-        judge = self._judge
+        judge, counts = self._judge, self._judge.verdicts.counts
         back = pulse < judge.last - self._time_tolerance
         if back and pulse > judge.confirmed:
-            self._out_of_order += judge.drop_later(pulse, _RESTART - 1)
+            counts['out_of_order'] += judge.drop_later(pulse, _RESTART - 1)
             back = pulse < judge.last - self._time_tolerance
         if back or (self._held and self._continues_held(pulse)):
             self._hold(pulse)
             return
-        self._out_of_order += len(self._held)
+        counts['out_of_order'] += len(self._held) + (pulse < judge.last)
         self._held = []
-        if pulse < judge.last:
-            self._out_of_order += 1
-        else:
+        if pulse >= judge.last:
             judge.take([pulse])
 
     def _continues_held(self, pulse: float) -> bool:
@@ -287,11 +282,11 @@ class PulseValidator:
     def _hold(self, pulse: float) -> None:
         """Let a pulse wait after time ran back, or begin a new run with the waiting pulses."""
         if self._held and pulse <= self._held[-1]:
-            self._out_of_order += len(self._held)
+            self._judge.verdicts.counts['out_of_order'] += len(self._held)
             self._held = []
         self._held.append(pulse)
         if len(self._held) == _RESTART or pulse > self._judge.last:
-            self._restarts += 1
+            self._judge.verdicts.counts['restarts'] += 1
             self._judge.flush()
             self._judge.forget()
             self._sink.restart()

@@ -30,7 +30,7 @@ class Verdicts:
         self._marks, self._apart, self._alike, self._before = marks, 0, 0, 0  # of strays
         self.counts = dict.fromkeys(
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
-             'unlocked', 'relearnt', 'displaced'), 0)
+             'unlocked', 'relearnt', 'displaced', 'out_of_order', 'restarts', 'non_finite'), 0)
         self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
         self.messages: list[str] = []
 
