@@ -25,12 +25,12 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands import average, close_loop
 from sa_jitter_ros.errors import ParameterError, SaJitterError
-from sa_jitter_ros.offline.files import TEMPORARY
 from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
 from sa_jitter_ros.offline.processes import Failure
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+from sa_jitter_ros.whole_files import TEMPORARY
 
 
 def work(job):

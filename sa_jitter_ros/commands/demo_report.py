@@ -21,9 +21,10 @@ from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.figures import write_figures
-from sa_jitter_ros.offline.files import finished_together, Signals, write_averages
+from sa_jitter_ros.offline.files import ARRAYS, Signals, write_averages
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import MachineFile
+from sa_jitter_ros.whole_files import finished_together
 
 Results = Sequence[Mapping[str, AverageMessage]]
 _FIELDS = ('raw_amplitude', 'corrected_amplitude', 'noise_standard_deviation', 'attenuation')
@@ -42,7 +43,7 @@ def write_results(plan: Plan, results: Mapping[str, Results],
     """Write arrays, table and figures of all shafts, and return a table; raises OSError."""
     file = MachineFile.read(plan.params)
     signals, machine = signals_of(plan, file.machine), file.averager
-    with finished_together(output) as folder:
+    with finished_together(output, last=ARRAYS) as folder:
         series = []
         for shaft, averages in results.items():
             collector = ShaftCollector(shaft, folder.parent)

@@ -26,8 +26,8 @@ from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals,
-    TABLE, write_averages, write_rows)
+    ARRAYS, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals, TABLE,
+    write_averages, write_rows)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -38,6 +38,7 @@ from sa_jitter_ros.recordings.channel_check import (
     channel_faults, fault_texts, is_lost, without_channels)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
+from sa_jitter_ros.whole_files import finished_together
 
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
@@ -241,7 +242,7 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
                       job.machine.machine, limits)
     averager = RecordingAverager(recording, values, detector_values(job.machine), limits, found)
-    with finished_together(Path(job.folder)) as folder:
+    with finished_together(Path(job.folder), last=ARRAYS) as folder:
         series = collect(averager, folder.parent, progress)
         if not series:
             raise averager.none()

@@ -33,11 +33,12 @@ from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import KINDS, mean_of, monitored, MonitoredAverage
-from sa_jitter_ros.offline.files import read_averages, Signals, waveforms, write_lines
+from sa_jitter_ros.offline.files import read_averages, Signals, waveforms
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.offline.settings import section
 from sa_jitter_ros.parameter_file import value_of
 from sa_jitter_ros.parameters import listed
+from sa_jitter_ros.whole_files import whole_file
 
 CHANGES, FIGURE = 'changes.json', 'changes.png'
 MONITOR = 'change_monitor'
@@ -121,8 +122,8 @@ class Changes:
 
     def write(self, output: Path) -> None:
         """Write `changes.json`; raises OSError."""
-        text = json.dumps(self.report(), indent=1, allow_nan=False)
-        write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
+        with whole_file(output / CHANGES) as file:
+            file.write(json.dumps(self.report(), indent=1, allow_nan=False) + '\n')
 
     def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
         return {**item.content(), 'channel': self.recordings[0].channels[item.channel],

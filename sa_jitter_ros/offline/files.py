@@ -17,16 +17,13 @@ with a machine by its parts, `part` is the one that makes the order; the last co
 why an order has no amplitude.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 import csv
 from dataclasses import asdict, dataclass, field, fields
 import json
 import math
-import os
 from pathlib import Path
 import shutil
-import tempfile
 from typing import Any, TextIO, TypeVar
 
 import numpy as np
@@ -38,9 +35,9 @@ from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.tacholess.recording import Tacholess
+from sa_jitter_ros.whole_files import TEMPORARY, whole_file
 
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
-TEMPORARY = '.averages.'  # prefix of folders whose files are not finished
 
 _HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycles',
            'fundamental_cycles', 'discarded_cycles')
@@ -113,26 +110,6 @@ class Signals:
         """Return name and unit of the channel in this place, for an axis."""
         unit = self.units[channel] if channel < len(self.units) else ''
         return f'{self.channel_names[channel]}\n[{unit or "unit unknown"}]'
-
-
-@contextmanager
-def finished_together(folder: Path) -> Iterator[Path]:
-    """
-    Yield a temporary folder, whose files get their names in `folder` at the end, or not at all.
-
-    `averages.npz` is last: where it is, all others are.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY) as temporary:
-            place = Path(temporary, 'finished')
-            place.mkdir()
-            yield place
-            for path in sorted(place.iterdir(), key=lambda path: path.name == ARRAYS):
-                os.replace(path, folder / path.name)
-    finally:
-        with suppress(OSError):  # it holds something
-            folder.rmdir()
 
 
 def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries],
@@ -215,15 +192,6 @@ def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) 
                                  for values, part, note in zip(orders, parts, notes))
 
 
-def write_lines(path: Path, lines: Callable[[TextIO], None]) -> None:
-    """Write a text file under a temporary name first; raises OSError."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=TEMPORARY) as temporary:
-        place = Path(temporary, path.name)
-        with place.open('w', encoding='utf-8', newline='') as file:
-            lines(file)
-        os.replace(place, path)
-
-
 def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[str, str]]
                 ) -> None:
     """
@@ -232,8 +200,8 @@ def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[st
     Its last column, `error`, is empty there; each of the `failures`, (name of a recording,
     reason), has a row of its own.
     """
-    def lines(file: TextIO) -> None:
-        columns: list[str] = []
+    columns: list[str] = []
+    with whole_file(path) as file:
         for folder in folders:
             with (folder / TABLE).open(encoding='utf-8', newline='') as part:
                 first = part.readline().rstrip('\n')
@@ -248,8 +216,6 @@ def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[st
             writer.writerow([*columns, 'error'])
         for name, reason in failures:
             writer.writerow([name, *[''] * (len(columns) - 1), reason])
-
-    write_lines(path, lines)
 
 
 def stamp(path: Path) -> list[list[Any]]:
@@ -268,15 +234,12 @@ def stamp(path: Path) -> list[list[Any]]:
 def write_rows(path: Path, rows: Sequence[Row]) -> list[Row]:
     """Write rows of recordings as a table, in the order of their names; return them so."""
     ordered = sorted(rows, key=lambda row: (row.recording, row.path))
-
-    def lines(file: TextIO) -> None:
+    with whole_file(path) as file:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(item.name for item in fields(rows[0]))
         for row in ordered:
             writer.writerow('; '.join(value) if isinstance(value, tuple) else value
                             for value in asdict(row).values())
-
-    write_lines(path, lines)
     return ordered
 
 
