@@ -209,7 +209,3 @@ class SynchronousAverager(MonitoringNode):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(SynchronousAverager, args)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

@@ -44,7 +44,6 @@ _HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycle
 _OVER_ANGLE = ('_waveform', '_average', '_standard_error', '_spectrum')  # ends of names
 _COLUMNS = ('recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
             'trigger_cycles', 'discarded_cycles', 'channel')
-_WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles')
 
 
 @dataclass(frozen=True)
@@ -126,11 +125,9 @@ def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries]
         'channel_names': np.array(signals.channel_names), 'units': np.array(signals.units),
         'shafts': np.array([item.shaft for item in series]),
         'about': np.array(json.dumps(json_values(about), allow_nan=False))}
-    for name in _HEADER:
-        arrays[name] = _typed(name, series[0][name])
+    arrays |= {name: series[0][name] for name in _HEADER}
     for item in series:
-        arrays |= {f'{item.shaft}_{name}': _typed(name, array)
-                   for name, array in item.arrays.items()}
+        arrays |= {f'{item.shaft}_{name}': array for name, array in item.arrays.items()}
     np.savez(folder / ARRAYS, **arrays)
 
 
@@ -170,10 +167,6 @@ def waveforms(folder: Path, shaft: str) -> Array:
         return np.asarray(arrays[f'{shaft}_waveform'])
 
 
-def _typed(name: str, array: Any) -> Any:
-    return np.asarray(array).astype(int) if name in _WHOLE else array
-
-
 def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
     writer = csv.writer(file, lineterminator='\n')
     of_order = series[0]['order_amplitude_fields'].tolist()
@@ -182,7 +175,7 @@ def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) 
     for item in series:
         parts = [[signals.machine.name_of(item.shaft, order)] * len(named)
                  for order in item.orders.tolist()]
-        header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
+        header = {name: item[name].tolist() for name in _HEADER}
         for row, (table, notes) in enumerate(zip(item['order_amplitude'], item['note'].tolist())):
             start = [signals.recording, item.shaft, *(
                 header[name][row] for name in _COLUMNS[2:-1])]

@@ -25,7 +25,7 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording, recording_errors, SampleSource
 
 Opened = Callable[[], AbstractContextManager[Any]]
 
@@ -53,35 +53,21 @@ class Channel:
     read: Callable[[Any, int, int], FloatArray]
 
 
-@dataclass(frozen=True)
-class ChannelSource:
-    """The samples of channels that were sampled together; `opened` opens their file."""
+def source_of(path: Path, parts: Sequence[Channel], opened: Opened) -> SampleSource:
+    """Return the samples of channels that were sampled together; `opened` opens their file."""
+    samples = parts[0].samples
 
-    path: Path
-    parts: tuple[Channel, ...]
-    opened: Opened
-
-    @property
-    def channels(self) -> int:
-        """Return the number of channels."""
-        return len(self.parts)
-
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-        return self.parts[0].samples
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks, with the file open all the time."""
-        with recording_errors(self.path), self.opened() as file:
-            for start in range(0, self.samples, samples_per_block):
-                stop = min(start + samples_per_block, self.samples)
-                rows = [np.asarray(part.read(file, start, stop), np.float64)
-                        for part in self.parts]
+    def blocks(samples_per_block: int) -> Iterator[FloatArray]:  # the file is open all the time
+        with recording_errors(path), opened() as file:
+            for start in range(0, samples, samples_per_block):
+                stop = min(start + samples_per_block, samples)
+                rows = [np.asarray(part.read(file, start, stop), np.float64) for part in parts]
                 if any(row.shape != (stop - start,) for row in rows):
                     raise RecordingError(f'samples {start} to {stop} cannot be read: the file is '
                                          'truncated or broken; copy it again')
                 yield np.stack(rows)
+
+    return SampleSource(len(parts), samples, blocks)
 
 
 def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: ChannelMap,
@@ -138,9 +124,9 @@ def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: Channe
             raise RecordingError(
                 f'{names[tach]} begins at {channels[tach].start:.9g} s and {names[chosen[0]]} at '
                 f'{first.start:.9g} s: export channels that begin together')
-        tach_source = ChannelSource(path, (channels[tach],), opened)
+        tach_source = source_of(path, [channels[tach]], opened)
     return Recording(
-        ChannelSource(path, tuple(channels[k] for k in chosen), opened), rate,
+        source_of(path, [channels[k] for k in chosen], opened), rate,
         start_time=first.start, channel_names=tuple(names[k] for k in chosen),
         units=tuple(channels[k].unit for k in chosen), tach=tach_source, tach_rate=tach_rate,
         remarks=tuple(remarks), path=str(path))
