@@ -88,8 +88,8 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     return settings
 
 
-def planned(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
-    """Return the jobs, and rows of recordings that cannot have one; raises ParameterError."""
+def planned(options: argparse.Namespace) -> list[AverageJob]:
+    """Return the jobs; raises ParameterError."""
     machine = MachineFile.read(options.params, options.given)
     if machine.unknown:
         print(f'average: {options.params}: ignored, because synchronous_averager has no such '
@@ -97,7 +97,7 @@ def planned(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
     return jobs_of(options, partial(
         AverageJob, machine=machine, options=read_options(options),
         fields=tuple(fields_of(options.fields)), figures=not options.no_figures,
-        state=options.state, tacholess=tacholess_options(options)), Row)
+        state=options.state, tacholess=tacholess_options(options)))
 
 
 def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Changes | None]:
@@ -107,7 +107,7 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     Return what became of them and, with a baseline, what has changed.
     """
     settings = settings_for_changes(options)
-    jobs, rows = planned(options)
+    jobs, rows = planned(options), list[Row]()
 
     def alone(job: AverageJob) -> Row:
         done = len(rows)
@@ -126,7 +126,8 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
         return rows, None
     averaged = {row.recording for row in rows if row.averages}
     found = find_changes(
-        options.output, [job.name for job in jobs if job.name in averaged], settings,
+        options.output, [job.name for job in jobs if job.name in averaged and not job.error],
+        settings,
         jobs[0].machine.machine, state=options.state)
     found.write(options.output)
     if not options.no_figures:

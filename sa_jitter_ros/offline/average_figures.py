@@ -83,8 +83,7 @@ def orders_figure(signals: Signals, series: ShaftSeries, prediction: Array | Non
         if np.isfinite(values).any():
             _stems(top, position + shift, values, colour, label)
     top.set_yscale('log')
-    unit = {signals.units[channel] for channel in strongest_lines(series).tolist()}
-    top.set_ylabel(f'amplitude [{" / ".join(sorted(unit)) or "unit unknown"}]')
+    top.set_ylabel(f'amplitude [{signals.unit_of(strongest_lines(series))}]')
     top.legend(fontsize='small')
     figure.suptitle(heading(signals, series, (
         f'{len(series)} averages of {np.median(series["trigger_cycles"]):.0f} trigger cycles, '
@@ -116,10 +115,8 @@ def orders_figure(signals: Signals, series: ShaftSeries, prediction: Array | Non
 
 def _stems(axes: Axes, position: Array, values: Array, color: str, label: str) -> None:
     """Draw the mean of each order, and the scatter of the averages as its bar."""
-    known = np.isfinite(values).any(axis=0)
-    mean, spread = np.full(known.shape, np.nan), np.full(known.shape, np.nan)
-    mean[known] = np.nanmean(values[:, known], axis=0)
-    spread[known] = np.nanstd(values[:, known], axis=0)
+    known = np.ma.masked_invalid(values)
+    mean, spread = (np.ma.filled(item, np.nan) for item in (known.mean(axis=0), known.std(axis=0)))
     axes.errorbar(position, mean, yerr=np.minimum(spread, 0.9 * mean), fmt='o', color=color,
                   markersize=4.0, capsize=3.0, label=f'{label}: mean, scatter of the averages')
 
@@ -156,8 +153,7 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
                     series.shaft, layout, int(channels[order]), order) if not relative],
                 names[order])
         panels[1, number].set_xlabel(label)
-    units = {signals.units[channels[order]] for order in chosen.tolist()}
-    panels[0, 0].set_ylabel(f'{kind} amplitude [{" / ".join(sorted(units)) or "unit unknown"}]')
+    panels[0, 0].set_ylabel(f'{kind} amplitude [{signals.unit_of(channels[chosen])}]')
     panels[1, 0].set_ylabel('phase [degrees]')
     panels[0, 0].set_ylim(bottom=0.0)
     figure.suptitle(heading(signals, series, 'tracked orders, ± 1 standard error'),

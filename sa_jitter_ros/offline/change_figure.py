@@ -57,7 +57,7 @@ def _levels(changes: Changes, monitor: ShaftMonitor) -> Array:
     """
     unknown = np.full((2, *monitor.layout.shape), np.nan)
     known = [monitor.baseline(1.0, item.state) for item in changes.recordings]
-    return np.stack([unknown if item is None else np.stack((item.mean, item.scatter))
+    return np.stack([unknown if item is None else np.stack((item.mean, np.sqrt(item.variance)))
                      for item in known], axis=1)
 
 

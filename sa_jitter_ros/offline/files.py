@@ -17,7 +17,7 @@ with a machine by its parts, `part` is the one that makes the order; the last co
 why an order has no amplitude.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import csv
 from dataclasses import asdict, dataclass, field, fields
 import json
@@ -52,6 +52,7 @@ class RecordingJob:
     One recording to work on: its `name` in the results, its `path`, the folder of its files.
 
     `options` are keywords of `read`. With `tacholess` the pulses are found in the vibration.
+    `error` says why it cannot be used beside the others.
     """
 
     name: str
@@ -59,9 +60,12 @@ class RecordingJob:
     folder: str
     options: Mapping[str, Any] = field(default_factory=dict)
     tacholess: Tacholess | None = None
+    error: str = ''
 
     def settings(self, **others: Any) -> dict[str, Any]:
         """Return all that decides the files, as values of JSON; raises RecordingError."""
+        if self.error:
+            raise RecordingError(self.error)
         found: dict[str, Any] = json_values({
             'files': stamp(Path(self.path)), 'path': self.path, 'options': self.options,
             'tacholess': self.tacholess and asdict(self.tacholess), **others})
@@ -107,8 +111,11 @@ class Signals:
 
     def label(self, channel: int) -> str:
         """Return name and unit of the channel in this place, for an axis."""
-        unit = self.units[channel] if channel < len(self.units) else ''
-        return f'{self.channel_names[channel]}\n[{unit or "unit unknown"}]'
+        return f'{self.channel_names[channel]}\n[{self.unit_of([channel])}]'
+
+    def unit_of(self, channels: Iterable[int]) -> str:
+        """Return the unit, or the units, of channels in some places, for an axis."""
+        return ' / '.join(sorted({self.units[place] for place in channels})) or 'unit unknown'
 
 
 def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries],

@@ -13,6 +13,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 import gc
+import os
 from pathlib import Path
 from typing import TypeVar
 
@@ -44,7 +45,7 @@ def find_recordings(paths: Sequence[Path], *, leave_out: Path | None = None) -> 
     found: dict[Path, Found] = {}
     names: dict[str, Path] = {}
     hidden = leave_out.resolve() if leave_out is not None else None
-    for given in paths:
+    for given in map(Path, map(os.path.abspath, paths)):
         for path in _below(given, hidden) if is_folder(given) else [given]:
             place = path.resolve()
             if place in found:

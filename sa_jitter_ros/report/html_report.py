@@ -29,6 +29,7 @@ Json = Any
 _TITLE = 'Keyphasor jitter: measured against predicted'
 _UNITS = {'keyphasor_rate': 'Hz', 'trigger_speed': 'Hz', 'sample_rate': 'Hz', 'jitter_std': 's',
           'jitter_table': 's'}
+_SHARES = ('measured', 'as declared', 'as found')  # of the true amplitude, heads of columns
 _ERRORS = (
     ('rms', 'RMS of observed minus predicted attenuation'),
     ('rms_standard_error', 'standard error that the RMS contains (in quadrature)'),
@@ -123,12 +124,10 @@ def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
         return
     against = ('those of the better keyphasor'
                if content['against'] == 'reference keyphasor' else 'the corrected amplitudes')
-    added = bool(content['missing_effects'])
+    shown = 3 if content['missing_effects'] else 2
     yield '<h2>What it does to the amplitudes</h2>'
-    yield table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
-        (order_text(item.order, item.name), percent_text(item.observed, item.standard_error),
-         *(percent_text(value, item.standard_error, shown=False)
-           for value in (item.before, *((item.after,) if added else ())))) for item in shares])
+    yield table(('order', *_SHARES[:shown]), [
+        (order_text(item['order'], item['name']), *_shares(item)[:shown]) for item in shares])
     yield ('<p class="quiet">Share of the true amplitude that an average keeps, with one standard '
            f'error; the mean over the channels, of {content["acquisitions"]["held_out"]} averages '
            f'that served no fit. Measured against {against}.</p>')
@@ -196,13 +195,16 @@ def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> s
 
 def _line_table(content: Mapping[str, Json]) -> str:
     return table(
-        ('order', 'channel', 'amplitude', 'measured', 'as declared', 'as found'),
+        ('order', 'channel', 'amplitude', *_SHARES),
         [(order_text(item['order'], item['name']), item['channel'],
-          measured_text(item['level'], None, content['unit']),
-          percent_text(item['observed'], item['standard_error']),
-          *(percent_text(item[key], item['standard_error'], shown=False)
-            for key in ('predicted_before', 'predicted_after')))
+          measured_text(item['level'], None, content['unit']), *_shares(item))
          for item in content['lines']], kind='cards')
+
+
+def _shares(item: Mapping[str, Json]) -> Sequence[str]:
+    """Return the texts of `_SHARES` of a line."""
+    return [percent_text(item[key], item['standard_error'], shown=key == 'observed')
+            for key in ('observed', 'predicted_before', 'predicted_after')]
 
 
 def _declared_table(content: Mapping[str, Json]) -> str:
