@@ -18,7 +18,6 @@ of the vibration. It says what each finding costs, and writes a parameter file f
 
 import argparse
 from collections.abc import Mapping, Sequence
-import json
 from pathlib import Path
 import sys
 from typing import Any
@@ -30,7 +29,7 @@ from sa_jitter_ros.commands.command_line import (
     tacholess_options)
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE, read_declaration
-from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
@@ -96,8 +95,7 @@ def write(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorChe
     """Check the recording and write all files; return their names, too."""
     found, recording = run(options, progress)
     options.output.mkdir(parents=True, exist_ok=True)
-    report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
-    (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
+    (options.output / 'keyphasor.json').write_text(json_text(found.report), encoding='utf-8')
     (options.output / 'machine.yaml').write_text(
         machine_file(found, options.recording.name, _declared(options.params)),
         encoding='utf-8')

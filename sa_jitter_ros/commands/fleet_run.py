@@ -19,8 +19,7 @@ from sa_jitter_ros.commands.command_line import FORMATS
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, remove_unfinished
-from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
-from sa_jitter_ros.offline.processes import Failure
+from sa_jitter_ros.offline.fleet import Failure, find_recordings, run_jobs
 
 Work = TypeVar('Work', bound=RecordingJob)
 Row = TypeVar('Row', bound=RecordingRow)

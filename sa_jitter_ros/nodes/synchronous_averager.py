@@ -53,7 +53,7 @@ class SynchronousAverager(MonitoringNode):
             self.parameters.declare(shaft_parameters(name))
         values = self.parameters.values()
         for name in names:
-            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given:
+            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given_values:
                 raise one_ratio(values, name)
         given = self.parameters.given_values
         limits = LimitWatch(Machine.among(given), names, list(channels_of(given)),
@@ -151,7 +151,7 @@ class SynchronousAverager(MonitoringNode):
             self._average_flow.came()
             self._shafts[name].publish(average, self._samples.scale, pause)
             self.set_missing(f'orders of {name}', without_amplitude(average.refused))
-            if f'{name}.orders' in self.parameters.given:
+            if f'{name}.orders' in self.parameters.given_values:
                 self._latest[name].append(average)
                 self.set_missing(f'lines of {name}', without_lines(
                     self._latest[name], fewest=_LATEST))

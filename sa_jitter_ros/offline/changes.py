@@ -19,14 +19,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import memory_of
 from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
@@ -109,7 +108,7 @@ class Changes:
 
     def report(self) -> dict[str, Any]:
         """Return the content of `changes.json`."""
-        found: dict[str, Any] = json_values({
+        return {
             'baseline': {'averages': self.learning, 'complete': all(
                 monitor.is_complete for monitor in self.monitors.values())},
             'changes': [*(self._content(item, self.since(item)) for item in self.limits.passed()),
@@ -117,13 +116,12 @@ class Changes:
                           for item in self.changes)],
             'events': list(self.events),
             'recordings': [item.name for item in self.recordings],
-            'left_out': dict(self.left_out)})
-        return found
+            'left_out': dict(self.left_out)}
 
     def write(self, output: Path) -> None:
         """Write `changes.json`; raises OSError."""
         with whole_file(output / CHANGES) as file:
-            file.write(json.dumps(self.report(), indent=1, allow_nan=False) + '\n')
+            file.write(json_text(self.report()))
 
     def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
         return {**item.content(), 'channel': self.recordings[0].channels[item.channel],

@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.offline.average_figures import (
-    orders_figure, tracked_orders_figure, waveform_figure)
+    gear_figure, orders_figure, tracked_orders_figure, waveform_figure)
 from sa_jitter_ros.offline.files import Signals
-from sa_jitter_ros.offline.gear_figures import gear_figure
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.offline.spectrum_figures import (
     envelope_figure, order_map_figure, spectra, spectrum_figure)

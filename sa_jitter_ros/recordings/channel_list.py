@@ -16,7 +16,7 @@ Formats of measuring systems are such lists (`list_formats`).
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,10 @@ class Channel:
     read: Callable[[Any, int, int], FloatArray]
 
 
+#: Channels of a file, why others are none, one sentence each, and what opens it.
+ChannelList = tuple[Sequence[Channel], Sequence[str], Opened]
+
+
 def source_of(path: Path, parts: Sequence[Channel], opened: Opened) -> SampleSource:
     """Return the samples of channels that were sampled together; `opened` opens their file."""
     samples = parts[0].samples
@@ -70,23 +74,24 @@ def source_of(path: Path, parts: Sequence[Channel], opened: Opened) -> SampleSou
     return SampleSource(len(parts), samples, blocks)
 
 
-def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: ChannelMap,
-                 sample_rate: float | None, left_out: Sequence[str] = (),
-                 opened: Opened = nullcontext) -> Recording:
+def recording_of(path: Path, listed: ChannelList, *, channel_map: ChannelMap,
+                 sample_rate: float | None) -> Recording:
     """
     Return the recording of some channels of a file, in the roles that the map gives them.
 
     Without names of vibration it is all channels of one rate, start and length, those that hold
     the most samples. The tach may have a rate of its own. `sample_rate` is used for channels
-    without one, and in place of one that is rounded. `left_out` says why
-    other channels of the file are none, one sentence each; `opened` opens what they read from.
+    without one, and in place of one that is rounded.
 
     >>> acc, key = (Channel((name,), 'g', rate, 0.0, int(rate), lambda file, start, stop:
     ...             np.zeros(stop - start)) for name, rate in (('acc', 100.0), ('key', 500.0)))
-    >>> recording_of(Path(), [acc, key], channel_map=ChannelMap(tach='key'), sample_rate=None)
+    >>> from contextlib import nullcontext
+    >>> recording_of(Path(), ([acc, key], (), nullcontext), channel_map=ChannelMap(tach='key'),
+    ...              sample_rate=None)
     Recording('.', 1 channel of 100 samples at 100 Hz (1 s), tach at 500 Hz, ratio 1)
     """
-    channels = [channel for channel in channels if channel.samples]
+    every, left_out, opened = listed
+    channels = [channel for channel in every if channel.samples]
     names = _unique([channel.names for channel in channels])
     if not channels:
         raise RecordingError('; '.join(['no channel with samples at a constant rate',
