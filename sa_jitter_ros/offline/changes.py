@@ -34,9 +34,8 @@ from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import KINDS, mean_of, monitored, MonitoredAverage
 from sa_jitter_ros.offline.files import read_averages, Signals, waveforms
 from sa_jitter_ros.offline.series import ShaftSeries
-from sa_jitter_ros.offline.settings import section
-from sa_jitter_ros.parameter_file import value_of
-from sa_jitter_ros.parameters import listed
+from sa_jitter_ros.offline.settings import section, values_of
+from sa_jitter_ros.parameters import converted, listed
 from sa_jitter_ros.whole_files import whole_file
 
 CHANGES, FIGURE = 'changes.json', 'changes.png'
@@ -172,12 +171,8 @@ def settings_of(params: Path | None, given: Sequence[str], learning: int) -> Set
 
     They are those of `change_monitor` in a machine file, and of texts `NAME:=VALUE`.
     """
-    values = {name: value for name, value in section(params, MONITOR).items() if name in SETTINGS}
-    for text in given:
-        name, _, value = text.partition(':=')
-        values[name] = value_of(value)
-    return Settings(learning_averages=learning, group_averages=1, **{
-        name: SETTINGS[name].convert(value) for name, value in values.items()})
+    return Settings(learning_averages=learning, group_averages=1, **converted(
+        section(params, MONITOR) | values_of(given), SETTINGS))
 
 
 def find_changes(output: Path, names: Sequence[str], settings: Settings,

@@ -57,7 +57,6 @@ class Rough:
 class _Track:
     spectra: CombSpectra
     speeds: FloatArray
-    evidence: NDArray[np.float32]
     path: NDArray[np.intp]
     total: float
     other: float
@@ -113,7 +112,7 @@ def _track(spectra: CombSpectra, orders: FloatArray, speed_range: tuple[float, f
     near = np.ceil(_NEAR * spectra.step / (orders.min() * speeds[path]) / step).astype(np.intp)
     apart = without(evidence, path, near)
     other, other_total = best_path(apart, largest)
-    return _Track(spectra, speeds, evidence, path, total, other_total,
+    return _Track(spectra, speeds, path, total, other_total,
                   float(np.median(speeds[other])), float(np.mean(apart <= RULED_OUT)))
 
 
