@@ -35,7 +35,6 @@ from sa_jitter_ros.offline.average_recording import (
     average_file, AverageJob, RECORDINGS, Row, write_tables)
 from sa_jitter_ros.offline.changes import Changes, find_changes, SETTINGS, settings_of
 from sa_jitter_ros.offline.settings import MachineFile
-from sa_jitter_ros.recordings.fields import fields_of
 
 
 def make_parser() -> Parser:
@@ -96,8 +95,7 @@ def planned(options: argparse.Namespace) -> list[AverageJob]:
               f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
     return jobs_of(options, partial(
         AverageJob, machine=machine, options=read_options(options),
-        fields=tuple(fields_of(options.fields)), figures=not options.no_figures,
-        state=options.state, tacholess=tacholess_options(options)))
+        figures=not options.no_figures, state=options.state, tacholess=tacholess_options(options)))
 
 
 def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Changes | None]:

@@ -36,6 +36,7 @@ from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import (
     channel_faults, fault_texts, is_lost, without_channels)
+from sa_jitter_ros.recordings.fields import FIELDS
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
 from sa_jitter_ros.whole_files import finished_together
@@ -54,12 +55,10 @@ class AverageJob(RecordingJob):
     """
     One recording to average.
 
-    `fields` among the options are those that the user gave. The channel `state`, a name or a
-    number, may be constant.
+    The channel `state`, a name or a number, may be constant.
     """
 
     machine: MachineFile
-    fields: tuple[str, ...] = ()
     figures: bool = True
     state: str = ''
 
@@ -234,7 +233,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     if job.tacholess is not None:
         recording, found = job.tacholess.pulses_of(recording, job.machine.machine)
         remarks.append(recording.remarks[-1])
-    values = averager_values(job.machine, recording, fields=job.fields)
+    values = averager_values(job.machine, recording, fields=[
+        name for name in job.options if name in FIELDS])
     if found is not None:  # errors that are alike, which the averager would take for single ones
         values = {**values, 'correct_jitter': False}
     labels = [(str(number), name) for number, name in zip(kept, recording.channel_names)]

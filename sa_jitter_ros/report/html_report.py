@@ -20,8 +20,7 @@ from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.number_text import measured_text, order_text, percent_text
 from sa_jitter_ros.report.figures import illustrate, Illustration
-from sa_jitter_ros.report.new_section import ONLY_SHAFT
-from sa_jitter_ros.report.report import parameter_unit
+from sa_jitter_ros.report.report import ONLY_SHAFT, parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 
 Json = Any

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.parameters import listed
-from sa_jitter_ros.tacholess.evidence import comb, CombSpectra, spectra_of
-from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
+from sa_jitter_ros.tacholess.evidence import (
+    best_path, comb, CombSpectra, RULED_OUT, spectra_of, without)
 
 _WINDOWS = (24.0, 12.0, 6.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
