@@ -24,8 +24,8 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
-    Parser, read_options, run_to_end, show, tacholess_options, whole_from)
+    add_fleet_options, add_work_options, few_collections, FORMATS, Parser, read_options,
+    run_to_end, show, tacholess_options, whole_from)
 from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
@@ -59,10 +59,8 @@ def make_parser() -> Parser:
                         help='folder for the results')
     parser.add_argument('--no-figures', action='store_true',
                         help='write arrays and tables only, no figures and no page')
-    parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_fleet_options(parser)
-    add_tacholess_options(parser)
-    add_recording_options(parser)
+    add_work_options(parser)
     return parser
 
 

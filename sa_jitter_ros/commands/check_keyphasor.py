@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, add_tacholess_options, FORMATS, Parser, read_options, run_to_end, show,
-    tacholess_options)
+    add_work_options, FORMATS, Parser, read_options, run_to_end, show, tacholess_options)
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE, read_declaration
 from sa_jitter_ros.json_values import json_text
@@ -53,9 +52,7 @@ def make_parser() -> Parser:
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of the machine: ratio, orders and pulses per '
                         'revolution of its first shaft, and its parts, which are checked')
-    parser.add_argument('--quiet', action='store_true', help='show no progress')
-    add_tacholess_options(parser)
-    add_recording_options(parser)
+    add_work_options(parser)
     return parser
 
 

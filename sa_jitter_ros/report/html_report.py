@@ -29,6 +29,7 @@ _TITLE = 'Keyphasor jitter: measured against predicted'
 _UNITS = {'keyphasor_rate': 'Hz', 'trigger_speed': 'Hz', 'sample_rate': 'Hz', 'jitter_std': 's',
           'jitter_table': 's'}
 _SHARES = ('measured', 'as declared', 'as found')  # of the true amplitude, heads of columns
+_BOUNDS = (('at least', 'lower_95'), ('at most', 'upper_95'))
 _ERRORS = (
     ('rms', 'RMS of observed minus predicted attenuation'),
     ('rms_standard_error', 'standard error that the RMS contains (in quadrature)'),
@@ -176,16 +177,11 @@ def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
 
 def _limit_table(content: Mapping[str, Json]) -> str:
     return table(('effect', 'parameter', 'at 95 %'), [
-        (item['name'], item['parameter'], ' and '.join(filter(None, (
-            bound and f'{word} {bound}' for word, bound in (
-                ('at least', _bound(item, 'lower_95', content)),
-                ('at most', _bound(item, 'upper_95', content)))))) or '–')
-        for item in content['limits']])
-
-
-def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> str:
-    return '' if item[key] is None else measured_text(item[key], None, parameter_unit(
-        item['name'], item['parameter'], item['unit'], content['unit']))
+        (item['name'], item['parameter'], ' and '.join(
+            f'{word} {measured_text(item[key], None, unit)}' for word, key in _BOUNDS
+            if item[key] is not None) or '–')
+        for item in content['limits'] for unit in [parameter_unit(
+            item['name'], item['parameter'], item['unit'], content['unit'])]])
 
 
 def _line_table(content: Mapping[str, Json]) -> str:
