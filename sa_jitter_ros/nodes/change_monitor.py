@@ -293,3 +293,7 @@ def baseline_path(file: str, machine: str, node: str) -> Path | None:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(ChangeMonitor, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -139,3 +139,7 @@ def prediction_message(prediction: Prediction) -> PredictionMessage:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(JitterPredictor, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -242,3 +242,7 @@ class LiveView(MonitoringNode):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(LiveView, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

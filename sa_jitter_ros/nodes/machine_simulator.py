@@ -215,3 +215,7 @@ class MachineSimulator(PlaybackNode):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(MachineSimulator, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -381,3 +381,7 @@ def average_of(message: AverageMessage) -> ReceivedAverage:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(ResidualAnalyser, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -209,3 +209,7 @@ class SynchronousAverager(MonitoringNode):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(SynchronousAverager, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -195,3 +195,7 @@ class TachDetector(MonitoringNode):
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(TachDetector, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -48,6 +48,7 @@ FOUND, RECORDINGS = 'found_pulses.npz', 'recordings.csv'
 _VERSION = 5  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
+_TOTALS = ('cycles_dropped', 'pulses_dropped', 'samples_dropped', 'gaps')  # of diagnostics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -248,8 +249,12 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
             raise averager.none()
         remarks += [*averager.passed[:_MOST_REMARKS // 2], *limits.warnings(),
                     *averager.doubts(series), *averager.stream.take_messages()[:_MOST_REMARKS]]
-        row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
-        row = replace(row, remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
+        row = Row(
+            job.name, job.path, averager.ended_early, sum(map(len, series)),
+            float(np.mean(series[0]['trigger_speed'])), averager.stream.counts.cycles,
+            **{name: averager.stream.totals[name] for name in _TOTALS},
+            corrections_refused=averager.refused,
+            remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
         write_averages(folder, signals, series, {
             'settings': settings, 'row': asdict(row), 'said': averager.passed,
             'limits': [*map(str, limits.passed())]})
@@ -276,16 +281,6 @@ def collect(averager: RecordingAverager, folder: Path, progress: Progress | None
             collectors[shaft] = ShaftCollector(shaft, folder)
         collectors[shaft].add(results, refused)
     return [collector.series() for collector in collectors.values()]
-
-
-def _counted(row: Row, averager: RecordingAverager, series: list[ShaftSeries]) -> Row:
-    totals = averager.stream.totals
-    return replace(
-        row, averages=sum(map(len, series)),
-        trigger_speed=float(np.mean(series[0]['trigger_speed'])),
-        trigger_cycles=averager.stream.counts.cycles, corrections_refused=averager.refused,
-        cycles_dropped=totals['cycles_dropped'], pulses_dropped=totals['pulses_dropped'],
-        samples_dropped=totals['samples_dropped'], gaps=totals['gaps'])
 
 
 def write_tables(output: Path, rows: Sequence[Row]) -> None:

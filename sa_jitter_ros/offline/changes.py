@@ -16,7 +16,7 @@ temperature, and show nothing of how the machine scatters from recording to reco
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 import math
@@ -188,27 +188,28 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings,
     orders = _common_orders(series for _, series, _ in averaged)
     recorded = [_recorded(output, name, signals, series, orders, settings, state)
                 for name, (signals, series, _) in zip(names, averaged)]
-    left_out = {item.name: item.reason for item in recorded if item.reason}
-    recorded = [item for item in recorded if not item.reason]
+    left_out: dict[str, str] = {}
+
+    def compared(reason: Callable[[Recorded], str]) -> list[Recorded]:
+        """Return the recordings that no reason leaves out."""
+        left_out.update((item.name, text) for item in recorded if (text := reason(item)))
+        return [item for item in recorded if item.name not in left_out]
+
+    recorded = compared(lambda item: item.reason)
     if not recorded:
         raise _too_few(recorded, settings, left_out)
     usual, _ = Counter(item.channels for item in recorded).most_common(1)[0]
-    for item in recorded:
-        if item.channels != usual:
-            left_out[item.name] = (f'has the channels {listed(item.channels)}, most have '
-                                   f'{listed(usual)}')
-    recorded = [item for item in recorded if item.name not in left_out]
+    recorded = compared(lambda item: '' if item.channels == usual else (
+        f'has the channels {listed(item.channels)}, most have {listed(usual)}'))
     apart = _in_time(recorded)
     recorded = apart or recorded
     learnt = [item for item, known in zip(recorded, _baseline(recorded, settings)) if known]
     speeds = [item.speed for item in learnt]
     low, high = min(speeds), max(speeds)
-    for item in recorded:
-        if not low / (1.0 + settings.speed_bin) <= item.speed <= high * (1.0 + settings.speed_bin):
-            left_out[item.name] = (f'turns at {item.speed:.4g} Hz, the baseline at {low:.4g} to '
-                                   f'{high:.4g} Hz: a longer baseline, or a larger speed_bin, '
-                                   'compares it')
-    recorded = [item for item in recorded if item.name not in left_out]
+    most = 1.0 + settings.speed_bin
+    recorded = compared(lambda item: '' if low / most <= item.speed <= high * most else (
+        f'turns at {item.speed:.4g} Hz, the baseline at {low:.4g} to {high:.4g} Hz: a longer '
+        'baseline, or a larger speed_bin, compares it'))
     if all(_baseline(recorded, settings)):
         raise _too_few(recorded, settings, left_out)
     return _watched(recorded, left_out, settings, machine, clock=bool(apart))
