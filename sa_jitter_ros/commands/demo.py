@@ -250,11 +250,9 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
 def stay(children: Sequence[subprocess.Popen[bytes]]) -> int:
     """Wait for Ctrl-C or SIGTERM, or the end of a node; return its status, 0 after a signal."""
     try:
-        while True:
-            for child in children:
-                if child.poll() is not None:
-                    return child.returncode
+        while not (ended := [child for child in children if child.poll() is not None]):
             time.sleep(0.5)
+        return ended[0].returncode
     except KeyboardInterrupt:
         return 0
 

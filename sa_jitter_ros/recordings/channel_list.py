@@ -25,6 +25,7 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.fields import MOST_NAMED, some_of
 from sa_jitter_ros.recordings.recording import Recording, recording_errors, SampleSource
 
 Opened = Callable[[], AbstractContextManager[Any]]
@@ -32,7 +33,6 @@ Opened = Callable[[], AbstractContextManager[Any]]
 _SAME_START = 0.01  # of a sample
 _ROUNDED = 1e-4  # relative, of a rate in a file
 _UNEVEN = 0.5  # of a sample, by which times may be off a constant rate
-_MOST_NAMED = 12  # channels in a message
 
 
 @dataclass(frozen=True)
@@ -95,11 +95,11 @@ def recording_of(path: Path, listed: ChannelList, *, channel_map: ChannelMap,
     names = _unique([channel.names for channel in channels])
     if not channels:
         raise RecordingError('; '.join(['no channel with samples at a constant rate',
-                                        *left_out[:_MOST_NAMED]]))
+                                        *left_out[:MOST_NAMED]]))
     try:
         chosen, tach = channel_map.roles(names)
     except RecordingError as error:
-        raise RecordingError('; '.join([str(error), *left_out[:_MOST_NAMED]])) from None
+        raise RecordingError('; '.join([str(error), *left_out[:MOST_NAMED]])) from None
     remarks = list(left_out)
     if not channel_map.vibration:
         together = Counter(_clock(channels[k]) for k in chosen)
@@ -108,9 +108,9 @@ def recording_of(path: Path, listed: ChannelList, *, channel_map: ChannelMap,
         chosen = tuple(k for k in chosen if _clock(channels[k]) == most)
         if others:
             remarks.append('left out, because they were not sampled with '
-                           f'{names[chosen[0]]}: {_listed(others)}')
+                           f'{names[chosen[0]]}: {some_of(others)}')
     if len({_clock(channels[k]) for k in chosen}) > 1:
-        raise RecordingError('channels of different rates, starts or lengths: ' + _listed([
+        raise RecordingError('channels of different rates, starts or lengths: ' + some_of([
             f'{names[k]} {channels[k].samples} samples at {channels[k].rate or 0.0:g} Hz'
             for k in chosen]) + '; choose those that were sampled together')
     first = channels[chosen[0]]
@@ -162,7 +162,3 @@ def _unique(names: Sequence[tuple[str, ...]]) -> list[str]:
     counts = Counter(name for several in names for name in dict.fromkeys(several))
     return [next((name for name in several if name and counts[name] == 1), str(number))
             for number, several in enumerate(names)]
-
-
-def _listed(texts: Sequence[str]) -> str:
-    return ', '.join(texts[:_MOST_NAMED]) + (', ...' if len(texts) > _MOST_NAMED else '')
