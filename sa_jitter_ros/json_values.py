@@ -11,6 +11,7 @@
 """Results as values that JSON has."""
 
 from collections.abc import Mapping
+import json
 import math
 from typing import Any
 
@@ -39,3 +40,8 @@ def json_values(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return value
+
+
+def json_text(value: Any, indent: int = 1) -> str:
+    """Return results as the text of a file in JSON."""
+    return json.dumps(json_values(value), indent=indent, allow_nan=False) + '\n'

@@ -22,7 +22,6 @@ from functools import cached_property, partial
 import math
 import os
 from pathlib import Path
-import tempfile
 from typing import Any
 import warnings
 
@@ -40,6 +39,7 @@ from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
 from sa_jitter_ros.report.report import parameters_text, report, summary
+from sa_jitter_ros.whole_files import finished_together
 
 Source = str | os.PathLike[str] | Recording
 Declared = str | os.PathLike[str] | DeclaredModel | Mapping[str, Any]
@@ -148,20 +148,12 @@ class Loop:
 
         files = {shaft: report_files(trace, self.shafts[shaft])
                  for shaft, trace in self.traces.items()}
-        write_files(folder, next(iter(files.values())) if len(files) == 1
-                    else files_of_all(self.report, files))
-
-
-def write_files(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> None:
-    """Write files by their path in a folder: first under temporary names, then rename all."""
-    Path(folder).mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix='.close_loop.') as temporary:
-        for name, content in files.items():
-            for place in (Path(temporary, name), Path(folder, name)):
-                place.parent.mkdir(exist_ok=True)
-            Path(temporary, name).write_bytes(content)
-        for name in files:
-            os.replace(Path(temporary, name), Path(folder, name))
+        written = next(iter(files.values())) if len(files) == 1 else files_of_all(
+            self.report, files)
+        with finished_together(Path(folder)) as place:
+            for name, content in written.items():
+                (place / name).parent.mkdir(exist_ok=True)
+                (place / name).write_bytes(content)
 
 
 def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,

@@ -38,6 +38,7 @@ CORE = {
     'machine': {'errors', 'parameter_file', 'parameters'},
     'samples': {'numpy'},
     'version': set(),
+    'whole_files': set(),
     'pulses': SCIENCE | {'errors', 'inner_loops', 'parameters', 'samples'},
     'averaging': SCIENCE | {
         'errors', 'inner_loops', 'machine', 'parameters', 'pulses', 'samples'},
@@ -56,20 +57,20 @@ CORE = {
         'samples'},
     'monitoring': SCIENCE | {
         'averaging', 'errors', 'json_values', 'machine', 'number_text', 'parameter_file',
-        'parameters'},
+        'parameters', 'whole_files'},
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'machine', 'parameter_file', 'parameters', 'pulses',
         'recordings'},
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'html_parts', 'json_values', 'keyphasor_check',
         'loop', 'machine', 'matplotlib', 'monitoring', 'number_text', 'parameter_file',
-        'parameters', 'pulses', 'recordings', 'samples', 'tacholess'},
+        'parameters', 'pulses', 'recordings', 'samples', 'tacholess', 'whole_files'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'html_parts', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
     'loop': {
         'arrays', 'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
-        'pulses', 'recordings', 'report'},
+        'pulses', 'recordings', 'report', 'whole_files'},
 }
 ROOMS = {
     **CORE,

@@ -316,12 +316,12 @@ def test_change_that_ends_is_taken_back():
 
 def test_one_wild_average_is_no_change_and_spoils_no_baseline():
     machine, monitor = watched(20)
-    scatter = monitor.baseline(16.6).scatter
+    variance = monitor.baseline(16.6).variance
     machine.gain[:] = machine.damage[:] = 30.0
     assert machine.run(monitor, 1) == []
     machine.gain[:] = machine.damage[:] = 1.0
     assert machine.run(monitor, 400) == []
-    np.testing.assert_allclose(monitor.baseline(16.6).scatter, scatter, rtol=0.5)
+    np.testing.assert_allclose(np.sqrt(monitor.baseline(16.6).variance / variance), 1.0, atol=0.5)
 
 
 def test_order_that_was_not_there_appears():
@@ -342,8 +342,8 @@ def test_absent_order_has_a_baseline_without_bias():
     monitor = machine.monitor()
     machine.run(monitor, 2000)
     found = monitor.baseline(16.6)
-    assert found.averages[0, 0] == 2000.0
-    error = found.scatter[0, 0] / np.sqrt(2000.0 / 5.0)
+    assert found.count[0, 0] == 2000.0 / 5.0
+    error = np.sqrt(found.variance[0, 0] / (2000.0 / 5.0))
     assert abs(found.mean[0, 0]) < 4.0 * error
     assert error == pytest.approx(2.0 * 0.01**2 / np.sqrt(2000.0), rel=0.2)
 
@@ -401,7 +401,8 @@ def test_covariance_is_that_of_the_machine():
     machine = Machine(9, load=0.02)
     monitor = machine.monitor()
     machine.run(monitor, 2000)
-    found = monitor.baseline(16.6).covariance[0]
+    scatter = np.sqrt(monitor.baseline(16.6).variance[0])
+    found = monitor.correlation()[0] * np.outer(scatter, scatter)
     square = LEVELS**2  # what is monitored
     expected = 4.0 / 5.0 * (0.02**2 * np.outer(square, square) + np.diag(square) * 0.01**2)
     scatter = np.sqrt(np.diag(expected))
@@ -428,7 +429,7 @@ def test_missing_numbers_cost_themselves_alone():
         assert all('order 19 of input, channel 0' in line for line in lines)
     found, = monitor.changes()
     assert found.change == pytest.approx(0.1, abs=4.0 * found.standard_error)
-    assert monitor.baseline(16.6).averages[0, 2] == 0.0
+    assert monitor.baseline(16.6).count[0, 2] == 0.0
 
 
 def test_averages_that_are_not_corrected_or_overlap_are_left_out():
@@ -439,7 +440,7 @@ def test_averages_that_are_not_corrected_or_overlap_are_left_out():
     machine.run(monitor, 10)
     assert (monitor.averages, monitor.uncorrected) == (20, 10)
     # the envelope of the residual signal needs no correction
-    assert monitor.baseline(16.6).averages[0].tolist() == [10.0] * 6 + [20.0]
+    assert monitor.baseline(16.6).count[0].tolist() == [2.0] * 6 + [4.0]
     machine.corrected = True
     average = machine.average()
     for later in range(31):  # sliding averages of 30 cycles

@@ -25,12 +25,11 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands import average, close_loop
 from sa_jitter_ros.errors import ParameterError, SaJitterError
-from sa_jitter_ros.offline.files import TEMPORARY
-from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
-from sa_jitter_ros.offline.processes import Failure
+from sa_jitter_ros.offline.fleet import Failure, find_recordings, run_jobs
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+from sa_jitter_ros.whole_files import TEMPORARY
 
 
 def work(job):
@@ -160,7 +159,7 @@ def test_cluster_without_dask_says_what_to_install(monkeypatch):
 
 def test_cluster_that_does_not_answer_is_one_line(monkeypatch):
     pytest.importorskip('distributed', reason="Dask is not installed: pip install '.[fleet]'")
-    monkeypatch.setattr('sa_jitter_ros.offline.cluster.ANSWER', 1.0)
+    monkeypatch.setattr('sa_jitter_ros.offline.fleet.ANSWER', 1.0)
     with socket.create_server(('127.0.0.1', 0)) as server:  # of something else
         threading.Thread(target=greet, args=(server, b'HTTP/1.1 400 Bad Request\r\n\r\n'),
                          daemon=True).start()
@@ -175,7 +174,7 @@ def test_cluster_that_does_not_answer_is_one_line(monkeypatch):
 def test_cluster_without_a_worker_is_one_line(monkeypatch):
     distributed = pytest.importorskip(
         'distributed', reason="Dask is not installed: pip install '.[fleet]'")
-    monkeypatch.setattr('sa_jitter_ros.offline.cluster.ANSWER', 1.0)
+    monkeypatch.setattr('sa_jitter_ros.offline.fleet.ANSWER', 1.0)
     with distributed.LocalCluster(n_workers=0, dashboard_address=None, host='127.0.0.1') as empty:
         address = empty.scheduler_address
         with pytest.raises(ParameterError, match=f'no worker: start some, dask worker {address}'):

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings import read
-from sa_jitter_ros.recordings.channel_list import Channel, ChannelSource
+from sa_jitter_ros.recordings.channel_list import Channel, source_of
 
 # pyuff leaves files that it writes, and all three libraries broken ones, to the collector.
 pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
@@ -188,7 +188,7 @@ def test_a_file_stays_open_through_a_pass():
         opened.append(True)
         yield 3.0
 
-    source = ChannelSource(Path(), 2 * (Channel(
+    source = source_of(Path(), 2 * (Channel(
         ('a',), '', 1.0, 0.0, 10, lambda file, start, stop: np.full(stop - start, file)),),
         open_file)
     assert [block.shape[1] for block in source.blocks(4)] == [4, 4, 2]

@@ -143,15 +143,15 @@ def test_page_begins_with_what_was_analysed_found_and_to_be_done(traces):
 def test_each_order_has_its_share_of_the_amplitude(traces, verdict):
     content = report(traces[verdict])
     shares = order_shares(content)
-    assert [item.order for item in shares] == [19.0, 38.0]
+    assert [item['order'] for item in shares] == [19.0, 38.0]
     for share in shares:
-        lines = [item for item in content['lines'] if item['order'] == share.order]
+        lines = [item for item in content['lines'] if item['order'] == share['order']]
         assert len(lines) == 2  # channels
-        assert share.observed == np.mean([item['observed'] for item in lines])
-        assert share.before == np.mean([item['predicted_before'] for item in lines])
+        assert share['observed'] == np.mean([item['observed'] for item in lines])
+        assert share['predicted_before'] == np.mean([item['predicted_before'] for item in lines])
     page = html(content, (), {}).replace('\u00a0', ' ')
     for share in shares:
-        assert f'>{percent_text(share.observed, share.standard_error)}<' in page
+        assert f'>{percent_text(share["observed"], share["standard_error"])}<' in page
     assert ('<th>as found</th>' in page.partition('What to do next')[0]) == (verdict == 'traced')
 
 
@@ -176,8 +176,8 @@ def test_steps_follow_from_what_was_found(traces):
     steps = ' '.join(next_steps(content))
     assert steps.startswith('Paste the section below')
     assert EFFECTS['excess_jitter'].remedy in steps
-    lost = min(order_shares(content), key=lambda item: item.observed)
-    assert ('correct_jitter: true' in steps) == (lost.observed < 0.95)
+    lost = min(order_shares(content), key=lambda item: item['observed'])
+    assert ('correct_jitter: true' in steps) == (lost['observed'] < 0.95)
     doubtful = {**content['missing_effects'][0], 'indistinguishable_from': ['phase_wander'],
                 'deciding_measurement': 'a run-up'}
     changed = {**content, 'missing_effects': [doubtful], 'undecided': ['clock_skew']}
@@ -187,7 +187,7 @@ def test_steps_follow_from_what_was_found(traces):
     assert 'Do not rely' in ' '.join(next_steps(report(traces['unexplained'])))
     steady = {**report(traces['none']), 'undecided': []}
     assert 'Nothing: predictions' in ' '.join(next_steps(steady)) or any(
-        item.observed < 0.95 for item in order_shares(steady))
+        item['observed'] < 0.95 for item in order_shares(steady))
 
 
 @pytest.mark.parametrize('shaft', ['shaft', 'input'])

@@ -15,9 +15,8 @@ import csv
 import numpy as np
 import pytest
 from sa_jitter_ros.commands import average, check_keyphasor, close_loop
-from sa_jitter_ros.tacholess.evidence import comb, spectra_of
+from sa_jitter_ros.tacholess.evidence import best_path, comb, spectra_of, without
 from sa_jitter_ros.tacholess.lines import demodulated, first_correction, noise_power
-from sa_jitter_ros.tacholess.path import best_path, without
 from scipy.interpolate import CubicSpline
 
 RATE = 4096.0

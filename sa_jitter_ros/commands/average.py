@@ -24,8 +24,8 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
-    Parser, read_options, run_to_end, show, tacholess_options, whole_from)
+    add_fleet_options, add_work_options, few_collections, FORMATS, Parser, read_options,
+    run_to_end, show, tacholess_options, whole_from)
 from sa_jitter_ros.commands.fleet_run import jobs_of, STOPPED, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
@@ -35,7 +35,6 @@ from sa_jitter_ros.offline.average_recording import (
     average_file, AverageJob, RECORDINGS, Row, write_tables)
 from sa_jitter_ros.offline.changes import Changes, find_changes, SETTINGS, settings_of
 from sa_jitter_ros.offline.settings import MachineFile
-from sa_jitter_ros.recordings.fields import fields_of
 
 
 def make_parser() -> Parser:
@@ -60,10 +59,8 @@ def make_parser() -> Parser:
                         help='folder for the results')
     parser.add_argument('--no-figures', action='store_true',
                         help='write arrays and tables only, no figures and no page')
-    parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_fleet_options(parser)
-    add_tacholess_options(parser)
-    add_recording_options(parser)
+    add_work_options(parser)
     return parser
 
 
@@ -88,16 +85,15 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     return settings
 
 
-def planned(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
-    """Return the jobs, and rows of recordings that cannot have one; raises ParameterError."""
+def planned(options: argparse.Namespace) -> list[AverageJob]:
+    """Return the jobs; raises ParameterError."""
     machine = MachineFile.read(options.params, options.given)
     if machine.unknown:
         print(f'average: {options.params}: ignored, because synchronous_averager has no such '
               f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
     return jobs_of(options, partial(
         AverageJob, machine=machine, options=read_options(options),
-        fields=tuple(fields_of(options.fields)), figures=not options.no_figures,
-        state=options.state, tacholess=tacholess_options(options)), Row)
+        figures=not options.no_figures, state=options.state, tacholess=tacholess_options(options)))
 
 
 def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Changes | None]:
@@ -107,7 +103,7 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     Return what became of them and, with a baseline, what has changed.
     """
     settings = settings_for_changes(options)
-    jobs, rows = planned(options)
+    jobs, rows = planned(options), list[Row]()
 
     def alone(job: AverageJob) -> Row:
         done = len(rows)
@@ -126,7 +122,8 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
         return rows, None
     averaged = {row.recording for row in rows if row.averages}
     found = find_changes(
-        options.output, [job.name for job in jobs if job.name in averaged], settings,
+        options.output, [job.name for job in jobs if job.name in averaged and not job.error],
+        settings,
         jobs[0].machine.machine, state=options.state)
     found.write(options.output)
     if not options.no_figures:

@@ -18,7 +18,6 @@ of the vibration. It says what each finding costs, and writes a parameter file f
 
 import argparse
 from collections.abc import Mapping, Sequence
-import json
 from pathlib import Path
 import sys
 from typing import Any
@@ -26,11 +25,10 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, add_tacholess_options, FORMATS, Parser, read_options, run_to_end, show,
-    tacholess_options)
+    add_work_options, FORMATS, Parser, read_options, run_to_end, show, tacholess_options)
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import NODE, read_declaration
-from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
@@ -54,9 +52,7 @@ def make_parser() -> Parser:
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of the machine: ratio, orders and pulses per '
                         'revolution of its first shaft, and its parts, which are checked')
-    parser.add_argument('--quiet', action='store_true', help='show no progress')
-    add_tacholess_options(parser)
-    add_recording_options(parser)
+    add_work_options(parser)
     return parser
 
 
@@ -96,8 +92,7 @@ def write(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorChe
     """Check the recording and write all files; return their names, too."""
     found, recording = run(options, progress)
     options.output.mkdir(parents=True, exist_ok=True)
-    report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
-    (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
+    (options.output / 'keyphasor.json').write_text(json_text(found.report), encoding='utf-8')
     (options.output / 'machine.yaml').write_text(
         machine_file(found, options.recording.name, _declared(options.params)),
         encoding='utf-8')

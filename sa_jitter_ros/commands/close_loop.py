@@ -25,8 +25,7 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, add_tacholess_options, few_collections, FORMATS,
-    Parser)
+    add_fleet_options, add_work_options, few_collections, FORMATS, Parser)
 from sa_jitter_ros.commands.progress import Progress
 
 
@@ -39,10 +38,8 @@ def make_parser() -> Parser:
                         help='ROS parameter file of jitter_predictor, or of the whole machine')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for report.json, report.html and the figures')
-    parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_fleet_options(parser)
-    add_tacholess_options(parser)
-    add_recording_options(parser)
+    add_work_options(parser)
     return parser
 
 

@@ -193,6 +193,13 @@ def add_tacholess_options(parser: argparse.ArgumentParser) -> None:
                        help='keep the pulses of the tach, and find only those that it lost')
 
 
+def add_work_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of all commands that work on recordings."""
+    parser.add_argument('--quiet', action='store_true', help='show no progress')
+    add_tacholess_options(parser)
+    add_recording_options(parser)
+
+
 def tacholess_options(options: argparse.Namespace) -> Tacholess | None:
     """Return how pulses are found, None where they are those of the tach."""
     if options.tacholess is None:

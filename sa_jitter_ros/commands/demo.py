@@ -16,7 +16,8 @@ compares the measured with the predicted attenuation.
 """
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 import os
 from pathlib import Path
 import signal
@@ -32,21 +33,26 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, FORMATS, Parser, player_options, read_options, run_to_end)
 from sa_jitter_ros.commands.demo_plan import (
     Plan, plan_doubts, plan_recording, plan_simulation, with_machine)
-from sa_jitter_ros.commands.demo_report import write_results
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, PredictionMessage)
-from sa_jitter_ros.offline.files import ARRAYS, TABLE
+from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
+from sa_jitter_ros.offline.figures import write_figures
+from sa_jitter_ros.offline.files import ARRAYS, Signals, TABLE, write_averages
+from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
+from sa_jitter_ros.offline.settings import MachineFile
 from sa_jitter_ros.parameter_file import shipped
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.channel_check import usable_channels
+from sa_jitter_ros.whole_files import finished_together
 from std_msgs.msg import Float64, Float64MultiArray
 
 # The timeouts end a demo that hangs; a busy computer needs tens of seconds to start the nodes.
@@ -60,6 +66,11 @@ RESULTS = ('synchronous_average', 'standard_error', 'order_amplitude', 'correcte
            'pulse_error', 'condition_indicator')
 NEEDED = {'synchronous_average', 'standard_error', 'order_amplitude'}
 LIVE_ACQUISITIONS = 4  # averages in a residual
+# Columns of the table, and mean, 5 % and 95 % quantile of a prediction.
+_FIELDS = ('raw_amplitude', 'corrected_amplitude', 'noise_standard_deviation', 'attenuation')
+_PREDICTED = [1, 4, 6]
+
+Results = Sequence[Mapping[str, AverageMessage]]
 
 
 class Watcher(Node):
@@ -81,21 +92,19 @@ class Watcher(Node):
             self.results[shaft] = {}
             for kind in RESULTS:
                 self.create_subscription(Float64MultiArray, f'{shaft}/{kind}',
-                                         self._add_to(shaft, kind), RESULT_QOS)
-            self._predicted(shaft, f'{shaft}/prediction')
-        self._predicted(shafts[0], 'prediction')  # of one shaft
+                                         partial(self._on_result, shaft, kind), RESULT_QOS)
+        for shaft, topic in ((shafts[0], 'prediction'),  # of one shaft
+                             *((shaft, f'{shaft}/prediction') for shaft in shafts)):
+            self.create_subscription(Float64MultiArray, topic, partial(
+                self._on_prediction, shaft), LATCHED_QOS)
 
-    def _add_to(self, shaft: str, kind: str) -> Callable[[Float64MultiArray], None]:
-        def add(message: Float64MultiArray) -> None:
-            result = decode_average(kind, message)
-            key = result.header.sequence, result.header.start_time
-            self.results[shaft].setdefault(key, {})[kind] = result
-        return add
+    def _on_result(self, shaft: str, kind: str, message: Float64MultiArray) -> None:
+        result = decode_average(kind, message)
+        key = result.header.sequence, result.header.start_time
+        self.results[shaft].setdefault(key, {})[kind] = result
 
-    def _predicted(self, shaft: str, topic: str) -> None:
-        def add(message: Float64MultiArray) -> None:
-            self.predictions[shaft] = decode_prediction(message)
-        self.create_subscription(Float64MultiArray, topic, add, LATCHED_QOS)
+    def _on_prediction(self, shaft: str, message: Float64MultiArray) -> None:
+        self.predictions[shaft] = decode_prediction(message)
 
     def _on_speed(self, message: Float64) -> None:
         self.speed = message.data
@@ -243,11 +252,9 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
 def stay(children: Sequence[subprocess.Popen[bytes]]) -> int:
     """Wait for Ctrl-C or SIGTERM, or the end of a node; return its status, 0 after a signal."""
     try:
-        while True:
-            for child in children:
-                if child.poll() is not None:
-                    return child.returncode
+        while not (ended := [child for child in children if child.poll() is not None]):
             time.sleep(0.5)
+        return ended[0].returncode
     except KeyboardInterrupt:
         return 0
 
@@ -292,6 +299,50 @@ def write_report(plan: Plan, watcher: Watcher, output: Path) -> None:
         if note:
             print(f'note: {note}')
     print(f'written: {ARRAYS}, {TABLE} and figures in {output}')
+
+
+def write_results(plan: Plan, results: Mapping[str, Results],
+                  predictions: Mapping[str, PredictionMessage], output: Path) -> str:
+    """Write arrays, table and figures of all shafts, and return a table; raises OSError."""
+    file = MachineFile.read(plan.params)
+    machine, unit = file.averager, '' if plan.unit == 'unknown' else plan.unit
+    signals = Signals(plan.title, tuple(range(len(plan.channels))), plan.channels,
+                      (unit,) * len(plan.channels), file.machine)
+    with finished_together(output, last=ARRAYS) as folder:
+        series = []
+        for shaft, averages in results.items():
+            collector = ShaftCollector(shaft, folder.parent)
+            for average in averages:
+                collector.add(average)
+            if averages:
+                series.append(collector.series())
+        write_averages(folder, signals, series, {})
+        write_figures(folder, signals, series, {
+            shaft: GearSettings(machine.get(f'{shaft}.mesh_orders', ()),
+                                machine.get(f'{shaft}.sidebands', 1)) for shaft in results}, {
+            shaft: item.values[:, _PREDICTED] for shaft, item in predictions.items()})
+        return '\n\n'.join((f'shaft {item.shaft}\n' if len(series) > 1 else '')
+                           + text_table(signals, item, predictions.get(item.shaft))
+                           for item in series)
+
+
+def text_table(signals: Signals, series: ShaftSeries, prediction: PredictionMessage | None) -> str:
+    """Return a table of the orders: amplitude, attenuation, predicted attenuation."""
+    channels = strongest_lines(series).tolist()
+    names = [signals.channel_names[channel] for channel in channels]
+    unit = f' [{signals.units[0]}]' if signals.units[0] else ''
+    width = max(12, *map(len, names))
+    columns = [np.ma.filled(np.ma.masked_invalid(on_strongest(series, name)).mean(axis=0), np.nan)
+               for name in _FIELDS]
+    lines = [f'{"order":>8} {"channel":>{width}} {"amplitude" + unit:>16} {"corrected":>10} '
+             f'{"noise":>9} {"attenuation":>12} {"predicted mean [5 % .. 95 %]":>30}']
+    for i, (raw, corrected, noise, attenuation) in enumerate(zip(*columns)):
+        mean, low, high = [float('nan')] * 3 if prediction is None else (
+            prediction.values[i, _PREDICTED])
+        lines.append(
+            f'{series.orders[i]:8g} {names[i]:>{width}} {raw:16.5g} {corrected:10.5g} '
+            f'{noise:9.2g} {attenuation:12.4f} {mean:14.4f} [{low:.4f} .. {high:.4f}]')
+    return '\n'.join(lines)
 
 
 def _parser() -> Parser:

@@ -306,9 +306,8 @@ def _width(level: float, limit: float) -> float:
 
 def _levels(values: np.ndarray, limit: float) -> list[float]:
     """Return the limit, and steps of 1, 2 and 5 per decade that are not close to it."""
-    decades = 10.0 ** np.arange(-6, 1)
-    steps = np.multiply.outer(decades, _STEPS).ravel()
-    low, high = np.nanmin(values), np.nanmax(values)
+    low, high = max(np.nanmin(values), 0.9 * _LEAST_SHARE), np.nanmax(values)
+    steps = np.array(LogLocator(subs=_STEPS, numticks=99).tick_values(low, high))
     steps = steps[(steps > low) & (steps < high) & (np.abs(np.log(steps / limit)) > 0.2)]
     return sorted([*steps.tolist(), *([limit] if low < limit < high else [])])
 

@@ -12,7 +12,6 @@
 
 import argparse
 from collections.abc import Callable, Sequence
-import os
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,29 +19,25 @@ from sa_jitter_ros.commands.command_line import FORMATS
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.offline.files import RecordingJob, RecordingRow, remove_unfinished
-from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
-from sa_jitter_ros.offline.processes import Failure
+from sa_jitter_ros.offline.fleet import Failure, find_recordings, run_jobs
 
 Work = TypeVar('Work', bound=RecordingJob)
 Row = TypeVar('Row', bound=RecordingRow)
 STOPPED = 'stopped; what was finished stays, the same command goes on from there'
 
 
-def jobs_of(options: argparse.Namespace, job: Callable[[str, str, str], Work],
-            failed: Callable[[str, str, str], Row]) -> tuple[list[Work], list[Row]]:
+def jobs_of(options: argparse.Namespace, job: Callable[..., Work]) -> list[Work]:
     """
-    Return a job for each recording of a command line, and rows of those that cannot have one.
+    Return a job for each recording of a command line; raises ParameterError if there is none.
 
-    `job` makes one of name, path and folder, `failed` a row of name, path and reason. Raises
-    ParameterError if there is no recording.
+    `job` makes one of name, path, folder and `error`.
     """
     found = find_recordings(options.recordings, leave_out=options.output)
     if not found:
         raise ParameterError(f'{", ".join(map(str, options.recordings))}: no recording in this '
                              f'folder: give one with {FORMATS}')
-    return [job(item.name, os.path.abspath(item.path), str(options.output.absolute() / item.name))
-            for item in found if not item.error], [
-                failed(item.name, str(item.path), item.error) for item in found if item.error]
+    return [job(item.name, str(item.path), str(options.output.absolute() / item.name),
+                error=item.error) for item in found]
 
 
 def work_through(function: Callable[[Work], Row], jobs: Sequence[Work], rows: list[Row], *,
@@ -51,11 +46,8 @@ def work_through(function: Callable[[Work], Row], jobs: Sequence[Work], rows: li
     """
     Add a row for each job, as soon as it is done; raises as `run_jobs` does.
 
-    `failed` makes the row of a job without one, from name, path and reason. The rows that are
-    there already are of recordings without a job.
+    `failed` makes the row of a job without one, from name, path and reason.
     """
-    for known in rows:
-        _say(known, progress)
     for job in jobs:
         remove_unfinished(Path(job.folder))
     try:

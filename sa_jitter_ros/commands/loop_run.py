@@ -66,7 +66,7 @@ def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
               f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
     jobs, rows = jobs_of(options, partial(
         LoopJob, declared=os.path.abspath(options.declared), options=read_options(options),
-        tacholess=tacholess_options(options)), LoopRow)
+        tacholess=tacholess_options(options))), list[LoopRow]()
     try:
         work_through(loop_file, jobs, rows, failed=LoopRow, options=options, progress=progress)
     finally:

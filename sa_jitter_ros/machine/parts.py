@@ -185,16 +185,11 @@ class PlanetaryStage(Coupling):
 
     @property
     def speeds(self) -> dict[str, Fraction]:
-        """Return the speeds of the members, one of which is 1 (Willis)."""
-        if self.fixed == 'carrier':
-            return {'sun': Fraction(1), 'ring': -Fraction(self.sun, self.ring),
-                    'carrier': Fraction(0)}
-        sun, ring = Fraction(0), Fraction(0)
-        if self.fixed == 'ring':
-            sun = 1 + Fraction(self.ring, self.sun)
-        else:
-            ring = 1 + Fraction(self.sun, self.ring)
-        return {'sun': sun, 'ring': ring, 'carrier': Fraction(1)}
+        """Return the speeds of the members, but for a common factor (Willis)."""
+        about_carrier = {'sun': Fraction(1, self.sun), 'ring': -Fraction(1, self.ring),
+                         'carrier': Fraction(0)}
+        return {member: speed - about_carrier[self.fixed]
+                for member, speed in about_carrier.items()}
 
     @property
     def on_shafts(self) -> tuple[str, str]:

@@ -24,7 +24,6 @@ from itertools import count
 import json
 import os
 from pathlib import Path
-import tempfile
 from typing import Any, TextIO
 import zipfile
 
@@ -35,6 +34,7 @@ from sa_jitter_ros.monitoring.evidence import below
 from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import Layout
 from sa_jitter_ros.parameter_file import require_regular_file
+from sa_jitter_ros.whole_files import finished_together
 
 FORMAT = 'sa_jitter_ros change baseline 1'
 _LARGEST_FILE = 1 << 28
@@ -104,19 +104,12 @@ def write_baseline(path: Path, machine: str, monitors: Mapping[str, ShaftMonitor
         f'{shaft}/{name}': array for shaft, item in monitors.items()
         for name, array in item.state().items()}
     arrays['machine'] = np.array(json.dumps(about))
-    temporary = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f'.{path.name}.',
-                                         delete=False) as file:
-            temporary = Path(file.name)
+        with finished_together(path.parent) as folder, (folder / path.name).open('wb') as file:
             np.savez_compressed(file, **arrays)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise RecordingError(f'{path}: the baseline cannot be written: '
                              f'{error.strerror or error}') from error
 
@@ -133,27 +126,25 @@ def read_baseline(path: Path, machine: str, settings: Settings, share: float
         if not path.exists():
             return {}
         about, arrays = _read(path)
+        if about['machine'] != machine:
+            raise RecordingError(
+                f'{path}: is the baseline of machine {about["machine"]!r}, this one is '
+                f'{machine!r} (hardware_id): give another baseline_file')
+        for name, value in about['settings'].items():
+            if getattr(settings, name) != value:
+                raise RecordingError(
+                    f'{path}: was learnt with {name} {value}, now it is '
+                    f'{getattr(settings, name)}: set it as before, or give another baseline_file')
+        return {shaft: _restored(shaft, layout, arrays, settings, share)
+                for shaft, layout in about['shafts'].items()}
+    except RecordingError:
+        raise
     except OSError as error:
         raise RecordingError(f'{path}: {error.strerror or error}') from error
     except Exception as error:  # damaged zip files raise exceptions of many types
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RecordingError(f'{path}: is no intact baseline ({reason}): restore it from a '
                              'backup, or move it away to learn again') from error
-    if about['machine'] != machine:
-        raise RecordingError(
-            f'{path}: is the baseline of machine {about["machine"]!r}, this one is {machine!r} '
-            '(hardware_id): give another baseline_file')
-    for name, value in about['settings'].items():
-        if getattr(settings, name) != value:
-            raise RecordingError(
-                f'{path}: was learnt with {name} {value}, now it is {getattr(settings, name)}: '
-                'set it as before, or give another baseline_file')
-    try:
-        return {shaft: _restored(shaft, layout, arrays, settings, share)
-                for shaft, layout in about['shafts'].items()}
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise RecordingError(f'{path}: is no intact baseline ({error}): restore it from a backup, '
-                             'or move it away to learn again') from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

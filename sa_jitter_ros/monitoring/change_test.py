@@ -76,12 +76,9 @@ def memory_of(values: FloatArray) -> float:
     True
     """
     count = len(values)
-    known = np.isfinite(values)
-    number = np.maximum(known.sum(axis=0), 1)
-    found = np.where(known, values, 0.0)
-    found = np.where(known, found - found.sum(axis=0) / number, 0.0)
-    scatter = np.sqrt((found**2).sum(axis=0) / number)
-    found = found / np.where(scatter > 0.0, scatter, np.inf)
+    known = np.ma.masked_invalid(values)
+    found = known - known.mean(axis=0)
+    found = np.ma.filled(found / found.std(axis=0), 0.0)  # of constant ones, too
     square = float((found**2).sum())
     lagged = float((found[1:] * found[:-1]).sum()) / square if square else 0.0
     mean = (lagged * count / (count - 1.0) + 1.0 / count) / (1.0 - 3.0 / count)

@@ -27,7 +27,7 @@ from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
 from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
-from sa_jitter_ros.monitoring.speed_bin import SpeedBin
+from sa_jitter_ros.monitoring.speed_bin import Moments, SpeedBin
 from sa_jitter_ros.parameters import fixed, Parameter, Values
 from scipy import special
 
@@ -164,21 +164,6 @@ class Change:
         return (f'{what} of {self.shaft}, channel {self.channel}: '
                 f'{100.0 * self.change:+.{digits}f} +- {error:.{digits}f} %, since {since}; '
                 f'the keyphasor explains {100.0 * self.keyphasor_share:.1f} %')
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """
-    What is known of a shaft at one speed, of means of a group of averages.
-
-    `averages`, `mean` and `scatter` are arrays (channel, quantity), `covariance` (channel,
-    quantity, quantity), of the values of a `MonitoredAverage`.
-    """
-
-    averages: FloatArray
-    mean: FloatArray
-    scatter: FloatArray
-    covariance: FloatArray
 
 
 def _of_amplitude(change: float, error: float, doubt: float, square: float, least: float
@@ -395,17 +380,16 @@ class ShaftMonitor:
         np.einsum('cii->ci', found)[:] = 1.0
         return np.clip(found, -1.0, 1.0)
 
-    def baseline(self, speed: float, state: float = math.nan) -> Baseline | None:
-        """Return what is learnt at a trigger speed in Hz and a state, None where nothing is."""
+    def baseline(self, speed: float, state: float = math.nan) -> Moments | None:
+        """
+        Return what is learnt at a trigger speed in Hz and a state, None where nothing is.
+
+        It is of means of groups of averages: arrays (channel, quantity).
+        """
         key = self._bins.key(speed, state)
-        if key not in self._test.bins:
-            return None
-        place = self._test.bins[key]
-        known, shape = place.baseline(), self.layout.shape
-        scatter = np.sqrt(known.variance.reshape(shape))
-        return Baseline(place.count.reshape(shape) * self.settings.group_averages,
-                        known.mean.reshape(shape), scatter,
-                        self.correlation() * scatter[:, :, None] * scatter[:, None, :])
+        place = None if key is None else self._test.bins.get(key)
+        return None if place is None else Moments.of(*(item.reshape(
+            *item.shape[:-2], *self.layout.shape) for item in (place.learned, place.reference)))
 
     def usual(self) -> FloatArray:
         """

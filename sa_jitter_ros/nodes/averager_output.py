@@ -8,26 +8,35 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Publishers of the averager's results for one shaft."""
+"""Publishers of the averager's results for one shaft, also as texts that a person reads."""
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 import math
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rclpy.publisher import Publisher
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
-from sa_jitter_ros.averaging.indicators import GearSettings
-from sa_jitter_ros.averaging.results import ShaftResults
+from sa_jitter_ros.averaging.indicators import GearSettings, IN_UNIT
+from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage, ShaftResults
 from sa_jitter_ros.averaging.shortfall import Shortfall
-from sa_jitter_ros.monitoring.limits import LimitWatch
-from sa_jitter_ros.monitoring.quantities import monitored
+from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.machine import LEVELS, Machine
+from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
+from sa_jitter_ros.monitoring.quantities import best_amplitudes, monitored
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import encode_average
-from sa_jitter_ros.nodes.summary import summary_of
+from sa_jitter_ros.number_text import HALF_95, measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
+from sa_jitter_ros.recordings.message_layouts import encode_time
 from std_msgs.msg import Float64MultiArray
 
 ROUNDING = 1e-9  # relative scatter of a constant that was resampled
+_ORDERS = 10  # of a summary, the strongest ones
+_STATUS = dict(zip(('', *LEVELS), (
+    DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)))
 
 
 class ShaftOutput:
@@ -84,3 +93,67 @@ class ShaftOutput:
         self._node.set_missing(f'correction of {self._name}',
                                f'refused for {self._refusals}: {self.refusal}'
                                if self._refusals else '')
+
+
+def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: ChannelScale,
+               hardware_id: str, machine: Machine, passed: Sequence[PassedLimit] = ()
+               ) -> DiagnosticArray:
+    """
+    Return one status for each channel; `results` are those of `ShaftResults`.
+
+    Its level is that of the worst of the limits that are `passed`, the worst first.
+    """
+    table = results['order_amplitude']
+    message = DiagnosticArray()
+    try:
+        stamp = encode_time(table.header.end_time)
+    except MessageError:  # beyond the year 2038
+        stamp = 0, 0
+    message.header.stamp.sec, message.header.stamp.nanosec = stamp
+    for channel, (name, unit) in enumerate(zip(channels.names, channels.units)):
+        orders = dict(_orders(table.values[channel], unit, partial(machine.name_of, shaft)))
+        values = {'sequence': str(table.header.sequence),
+                  'trigger_speed_hz': f'{table.header.mean_trigger_speed:.6g}',
+                  **orders, **_indicators(results, channel, unit)}
+        worst = next((item for item in passed if item.channel == channel), None)
+        message.status.append(DiagnosticStatus(
+            level=_STATUS[worst.level if worst else ''], name=f'{shaft}: {name}',
+            hardware_id=hardware_id, message=str(
+                worst or f'average {table.header.sequence} of {table.header.trigger_cycles} '
+                f'trigger cycles at {table.header.mean_trigger_speed:.4g} Hz'),
+            values=[KeyValue(key=key, value=value) for key, value in values.items()]))
+    return message
+
+
+def _orders(table: FloatArray, unit: str, name_of: Callable[[float], str]
+            ) -> Iterator[tuple[str, str]]:
+    """Iterate over the strongest orders of a table (order, field), or names, and their texts."""
+    field = dict(zip(AMPLITUDE_FIELDS, table.T))
+    amplitude, error, _ = best_amplitudes(table)
+    known = np.flatnonzero(np.isfinite(amplitude))
+    for place in sorted(known[np.argsort(-amplitude[known])][:_ORDERS]):
+        order = field['order'][place]
+        yield name_of(order) or order_text(order), (
+            f'{_interval(amplitude[place], error[place], unit)}, '
+            f'attenuation {field["attenuation"][place]:.3g}')
+
+
+def _indicators(results: Mapping[str, AverageMessage], channel: int, unit: str) -> dict[str, str]:
+    found, errors = (results.get(f'condition_indicator{end}') for end in ('', '_error'))
+    if found is None or errors is None:
+        return {}
+    return {name: _interval(value, error, unit if name in IN_UNIT else '')
+            for name, value, error in zip(found.names, found.values[channel],
+                                          errors.values[channel]) if math.isfinite(value)}
+
+
+def _interval(value: float, error: float, unit: str) -> str:
+    """
+    Return a value with half of its 95 % interval.
+
+    >>> _interval(0.99823, 0.0061, 'm/s^2')
+    '0.998 +- 0.012 m/s^2'
+    """
+    half = HALF_95 * error
+    text = measured_text(float(value), float(half)) if math.isfinite(half) else f'{value:.4g}'
+    return ' '.join(filter(None, (text.replace('±', '+-'), unit)))

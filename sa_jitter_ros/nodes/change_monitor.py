@@ -25,7 +25,7 @@ from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor
-from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
+from sa_jitter_ros.monitoring.monitor import PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.monitoring.operating import OperatingState
 from sa_jitter_ros.monitoring.quantities import KINDS
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -213,13 +213,10 @@ class ChangeMonitor(MonitoringNode):
         severe: list[str] = []
         others: list[str] = []
         for item in self._monitor.changes():
-            (severe if self._is_severe(item) else others).append(str(item))
+            least = abs(item.change) - 2.0 * item.standard_error
+            (severe if least >= self._values['severe_change'] else others).append(str(item))
         self.set_fault('change', first_of(severe))
         self.set_missing('the machine has changed', first_of(others))
-
-    def _is_severe(self, item: Change) -> bool:
-        least = abs(item.change) - 2.0 * item.standard_error
-        return least >= float(self._values['severe_change'])
 
     def _publish(self) -> None:
         content = self._monitor.report() if self._monitor is not None else {

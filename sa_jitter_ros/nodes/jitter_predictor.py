@@ -48,7 +48,7 @@ class JitterPredictor(MonitoringNode):
         super().__init__(NODE, (SHAFTS,), **node_kwargs)
         shafts = self.parameters.values()[SHAFTS.name]
         self.parameters.declare([
-            item for item in predictor_parameters(shafts, self.parameters.given)
+            item for item in predictor_parameters(shafts, self.parameters.given_values)
             if item is not SHAFTS])
         self._values = self.parameters.values()
         self._declaration = declaration_of(self._values)

@@ -26,7 +26,7 @@ import json
 import socket
 from socketserver import TCPServer
 import sys
-from threading import BoundedSemaphore, Thread
+from threading import Thread
 import time
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -37,7 +37,6 @@ PORTS_TRIED = 20  # from `port` on, so that a second view on the same host start
 CONNECTIONS = 32  # at once; a further one takes the place of the slowest request
 REQUEST_SECONDS = 10.0  # for all of a request to arrive
 ANSWER_SECONDS = 60.0  # for the answer to leave, which a slow line carries
-END_SECONDS = 0.5  # for the thread of an ended connection to stop
 KINDS = {'html': 'text/html', 'css': 'text/css', 'js': 'text/javascript'}
 HEADERS = {
     'Cache-Control': 'no-store',
@@ -95,7 +94,6 @@ class PageServer(ThreadingHTTPServer):
         self.pages['/'] = self.pages['/index.html']
         self.snapshot = snapshot
         self.requests = self.refused = 0
-        self._free = BoundedSemaphore(CONNECTIONS)
         self._deadlines: dict[socket.socket, float] = {}
         self._asking: dict[socket.socket, None] = {}  # those whose request has not arrived yet
         self.address_family = socket.AF_INET6 if ':' in host else socket.AF_INET
@@ -142,13 +140,16 @@ class PageServer(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve in a thread, in place of the slowest request if there are too many."""
-        if self._free.acquire(blocking=False) or self._in_place_of_the_slowest():
-            self._deadlines[request] = time.monotonic() + REQUEST_SECONDS
-            self._asking[request] = None
-            super().process_request(request, client_address)
-        else:
-            self.refused += 1
-            self.shutdown_request(request)
+        if len(self._deadlines) >= CONNECTIONS:
+            slowest = next(iter(list(self._asking)), None)  # the one that asks for longest
+            if slowest is None:
+                self.refused += 1
+                self.shutdown_request(request)
+                return
+            self._end(slowest)
+        self._deadlines[request] = time.monotonic() + REQUEST_SECONDS
+        self._asking[request] = None
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Serve one connection."""
@@ -157,15 +158,6 @@ class PageServer(ThreadingHTTPServer):
         finally:
             self._deadlines.pop(request, None)
             self._asking.pop(request, None)
-            self._free.release()
-
-    def _in_place_of_the_slowest(self) -> bool:
-        """Return whether there is a place since the connection that asks for longest ended."""
-        slowest = next(iter(list(self._asking)), None)
-        if slowest is None:
-            return False
-        self._end(slowest)
-        return self._free.acquire(timeout=END_SECONDS)
 
     def _end(self, connection: socket.socket) -> None:
         self.refused += 1

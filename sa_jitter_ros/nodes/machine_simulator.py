@@ -160,13 +160,11 @@ class MachineSimulator(PlaybackNode):
         self.machine = machine_of(values)
         self._volts = scale_of(named, self.machine.channels)
         rate, channels = self.machine.sample_rate, self.machine.channels
-        self._block = self.block_samples(rate, channels)
         self._samples = round(values['duration'] * rate)
         self._pulses = values['tach'] in ('pulses', 'both')
         self._with_waveform = values['tach'] in ('waveform', 'both')
         self._done = 0
-        self.begin(portion_seconds=self._block / rate, portion_bytes=8 * self._block * channels,
-                   pulses=self._pulses, waveform=self._with_waveform)
+        self.begin(rate, channels, pulses=self._pulses, waveform=self._with_waveform)
         self.get_logger().info(f'started: {channels} channels at {rate:g} Hz, shafts '
                                f'{", ".join(shafts)}')
 

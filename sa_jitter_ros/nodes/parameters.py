@@ -169,7 +169,7 @@ class ParameterSet:
         """Declare parameters; raises `ParameterError` for a value of wrong type or range."""
         for item in specifications:
             value = item.convert(self._node._parameter_overrides[item.name].value
-                                 if item.name in self.given
+                                 if item.name in self.given_values
                                  else self._following.get(item.name, item.default))
             self._node.declare_parameter(
                 item.name, value, descriptor_of(item), ignore_override=True)
@@ -182,11 +182,6 @@ class ParameterSet:
         given = self.given_values
         self.declare(channel_parameters(given))
         return channels_of(given)
-
-    @property
-    def given(self) -> frozenset[str]:
-        """Names that the user gave at the start, also those that match no parameter."""
-        return frozenset(self.given_values)
 
     @property
     def given_values(self) -> Values:

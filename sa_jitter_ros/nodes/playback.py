@@ -121,20 +121,17 @@ class PlaybackNode(MonitoringNode):
 
     # --- starting ---
 
-    def block_samples(self, sample_rate: float, channels: int) -> int:
-        """Return the number of samples in a message."""
+    def begin(self, sample_rate: float, channels: int, *, pulses: bool, waveform: bool) -> None:
+        """Create the publishers of the keyphasor and start; call it at the end of `__init__`."""
         values = self.parameters.values()
         seconds, most = float(values['block_seconds']), int(values['message_bytes']) - 4096
-        return max(1, min(round(seconds * sample_rate), most // (8 * channels)))
-
-    def begin(self, *, portion_seconds: float, portion_bytes: int, pulses: bool,
-              waveform: bool) -> None:
-        """Create the publishers of the keyphasor and start; call it at the end of `__init__`."""
+        self._block = max(1, min(round(seconds * sample_rate), most // (8 * channels)))
+        self._portion_seconds, self._portion_bytes = (
+            self._block / sample_rate, 8 * self._block * channels)
         if pulses:
             self._tach_pulse = PulseOutput(self, self._tach_type)
         if waveform:
             self._waveform = self.create_output(self._sample_type, 'tach_waveform', INPUT_QOS)
-        self._portion_seconds, self._portion_bytes = portion_seconds, portion_bytes
         self._stream = self.portions()
         self._timer = self.create_steady_timer(self._period(self._pacer.rate), self._tick)
         self.parameters.watch(check=self.check, apply=self.apply)

@@ -89,9 +89,7 @@ class RecordingPlayer(PlaybackNode):
             self.get_logger().warning('only vibration is played: the recording has no keyphasor, '
                                       'or tach is none')
         self._passes = 0
-        self._block = self.block_samples(recording.sample_rate, recording.channels)
-        self.begin(portion_seconds=self._block / recording.sample_rate,
-                   portion_bytes=8 * self._block * recording.channels,
+        self.begin(recording.sample_rate, recording.channels,
                    pulses=self._pulse_times is not None, waveform=self._with_waveform)
         self.get_logger().info(
             f'started: {values["recording"]}, {recording.channels} channels at '

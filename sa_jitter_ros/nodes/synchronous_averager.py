@@ -35,6 +35,7 @@ from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names, Values
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings.channel_units import channels_of
+from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Float64, Float64MultiArray
 
 _LATEST = 6  # averages that tell whether orders hold lines
@@ -53,7 +54,7 @@ class SynchronousAverager(MonitoringNode):
             self.parameters.declare(shaft_parameters(name))
         values = self.parameters.values()
         for name in names:
-            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given:
+            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given_values:
                 raise one_ratio(values, name)
         given = self.parameters.given_values
         limits = LimitWatch(Machine.among(given), names, list(channels_of(given)),
@@ -75,9 +76,9 @@ class SynchronousAverager(MonitoringNode):
         self._target = self.create_output(Float64MultiArray, 'target_geometry', LATCHED_QOS)
         self._geometry: MarkOffsets | None = None  # the latest that was published
         self.create_input(self._samples.message_type, 'vibration', self._on_vibration)
-        self._tach = self.create_input(pulse_type, 'tach_pulse',
-                                       self._on_pulse_array if pulse_type is Float64MultiArray
-                                       else self._on_pulse_reference)
+        self._tach = self.create_input(
+            pulse_type, 'tach_pulse', self._on_pulse_reference if pulse_type is TimeReference else
+            lambda message: self._add_pulses(decode_pulse_array(message)))
         self._vibration_flow = self.watch_input(
             'vibration', 'vibration', 'look at sensor, amplifier and acquisition')
         self._pulse_flow = self.watch_input(
@@ -137,9 +138,6 @@ class SynchronousAverager(MonitoringNode):
             return
         self._add_pulses(times)
 
-    def _on_pulse_array(self, message: Float64MultiArray) -> None:
-        self._add_pulses(decode_pulse_array(message))
-
     def _add_pulses(self, times: FloatArray) -> None:
         if times.size:
             self._pulse_flow.came()
@@ -151,7 +149,7 @@ class SynchronousAverager(MonitoringNode):
             self._average_flow.came()
             self._shafts[name].publish(average, self._samples.scale, pause)
             self.set_missing(f'orders of {name}', without_amplitude(average.refused))
-            if f'{name}.orders' in self.parameters.given:
+            if f'{name}.orders' in self.parameters.given_values:
                 self._latest[name].append(average)
                 self.set_missing(f'lines of {name}', without_lines(
                     self._latest[name], fewest=_LATEST))
@@ -180,7 +178,7 @@ class SynchronousAverager(MonitoringNode):
         if self._cycles_per_second:
             self._average_flow.allowance = (
                 self._values['trigger_cycles'] / self._cycles_per_second)
-        if self._tach.msg_type is not Float64MultiArray:  # each keyphasor may have a publisher
+        if self._tach.msg_type is TimeReference:  # each keyphasor may have a publisher
             self.most_publishers[self._tach.topic_name] = len(self._sources)
 
     def summary(self) -> tuple[str, dict[str, str]]:

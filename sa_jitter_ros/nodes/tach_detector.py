@@ -178,15 +178,13 @@ class TachDetector(MonitoringNode):
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return the numbers of pulses found and of subscribers, the levels, the threshold."""
+        values = {'pulses': str(self._pulses), 'subscribers': str(self._output.subscribers)}
         if self._joint:
-            text, values = self._joint.summary()
-            return text, {**values, 'pulses': str(self._pulses),
-                          'subscribers': str(self._output.subscribers)}
+            text, others = self._joint.summary()
+            return text, {**others, **values}
         state = self._detector.state
-        values = {key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')}
-        values['polarity'] = state.polarity
-        values['pulses'] = str(self._pulses)
-        values['subscribers'] = str(self._output.subscribers)
+        values = {**{key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')},
+                  'polarity': state.polarity, **values}
         if self._timeline.layout is None:
             return 'no waveform received yet', values
         if np.isnan(state.threshold):

@@ -26,8 +26,8 @@ from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
-    finished_together, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals,
-    TABLE, write_averages, write_rows)
+    ARRAYS, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals, TABLE,
+    write_averages, write_rows)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -36,8 +36,10 @@ from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import (
     channel_faults, fault_texts, is_lost, without_channels)
+from sa_jitter_ros.recordings.fields import FIELDS
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.tacholess.found import CorrectedAmplitudes, FoundPulses
+from sa_jitter_ros.whole_files import finished_together
 
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
@@ -46,6 +48,7 @@ FOUND, RECORDINGS = 'found_pulses.npz', 'recordings.csv'
 _VERSION = 5  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
+_TOTALS = ('cycles_dropped', 'pulses_dropped', 'samples_dropped', 'gaps')  # of diagnostics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +56,10 @@ class AverageJob(RecordingJob):
     """
     One recording to average.
 
-    `fields` among the options are those that the user gave. The channel `state`, a name or a
-    number, may be constant.
+    The channel `state`, a name or a number, may be constant.
     """
 
     machine: MachineFile
-    fields: tuple[str, ...] = ()
     figures: bool = True
     state: str = ''
 
@@ -233,7 +234,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     if job.tacholess is not None:
         recording, found = job.tacholess.pulses_of(recording, job.machine.machine)
         remarks.append(recording.remarks[-1])
-    values = averager_values(job.machine, recording, fields=job.fields)
+    values = averager_values(job.machine, recording, fields=[
+        name for name in job.options if name in FIELDS])
     if found is not None:  # errors that are alike, which the averager would take for single ones
         values = {**values, 'correct_jitter': False}
     labels = [(str(number), name) for number, name in zip(kept, recording.channel_names)]
@@ -241,14 +243,18 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
                       job.machine.machine, limits)
     averager = RecordingAverager(recording, values, detector_values(job.machine), limits, found)
-    with finished_together(Path(job.folder)) as folder:
+    with finished_together(Path(job.folder), last=ARRAYS) as folder:
         series = collect(averager, folder.parent, progress)
         if not series:
             raise averager.none()
         remarks += [*averager.passed[:_MOST_REMARKS // 2], *limits.warnings(),
                     *averager.doubts(series), *averager.stream.take_messages()[:_MOST_REMARKS]]
-        row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
-        row = replace(row, remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
+        row = Row(
+            job.name, job.path, averager.ended_early, sum(map(len, series)),
+            float(np.mean(series[0]['trigger_speed'])), averager.stream.counts.cycles,
+            **{name: averager.stream.totals[name] for name in _TOTALS},
+            corrections_refused=averager.refused,
+            remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
         write_averages(folder, signals, series, {
             'settings': settings, 'row': asdict(row), 'said': averager.passed,
             'limits': [*map(str, limits.passed())]})
@@ -275,16 +281,6 @@ def collect(averager: RecordingAverager, folder: Path, progress: Progress | None
             collectors[shaft] = ShaftCollector(shaft, folder)
         collectors[shaft].add(results, refused)
     return [collector.series() for collector in collectors.values()]
-
-
-def _counted(row: Row, averager: RecordingAverager, series: list[ShaftSeries]) -> Row:
-    totals = averager.stream.totals
-    return replace(
-        row, averages=sum(map(len, series)),
-        trigger_speed=float(np.mean(series[0]['trigger_speed'])),
-        trigger_cycles=averager.stream.counts.cycles, corrections_refused=averager.refused,
-        cycles_dropped=totals['cycles_dropped'], pulses_dropped=totals['pulses_dropped'],
-        samples_dropped=totals['samples_dropped'], gaps=totals['gaps'])
 
 
 def write_tables(output: Path, rows: Sequence[Row]) -> None:

@@ -33,12 +33,12 @@ def write_figure(changes: Changes, output: Path) -> None:
 
 def changes_figure(changes: Changes) -> Figure:
     """Draw what has changed, the most certain first, then what is farthest from its baseline."""
-    levels = {shaft: _levels(changes, monitor) for shaft, monitor in changes.monitors.items()}
-    chosen = _chosen(changes, levels)
+    trends = {shaft: _trends(changes, monitor) for shaft, monitor in changes.monitors.items()}
+    chosen = _chosen(changes, trends)
     figure = Figure(figsize=(9.0, 1.5 * len(chosen) + 1.2), layout='constrained')
     panels = figure.subplots(len(chosen), sharex=True, squeeze=False)[:, 0]
     for axes, key in zip(panels, chosen):
-        _draw(axes, changes, key, levels)
+        _draw(axes, changes, key, trends)
     names = [item.name for item in changes.recordings]
     places = np.arange(0, len(names), -(-len(names) // _MOST_TICKS))
     panels[-1].set_xticks(places, [names[place] for place in places], rotation=30, ha='right',
@@ -49,49 +49,46 @@ def changes_figure(changes: Changes) -> Figure:
     return figure
 
 
-def _levels(changes: Changes, monitor: ShaftMonitor) -> Array:
+def _trends(changes: Changes, monitor: ShaftMonitor) -> Array:
     """
-    Return mean and scatter of the baseline for each recording.
+    Return the values of each recording, mean and scatter of the baseline in its bin.
 
-    They are (2, recording, channel, quantity), of the bin of the recording.
+    They are (3, recording, channel, quantity).
     """
-    unknown = np.full((2, *monitor.layout.shape), np.nan)
-    known = [monitor.baseline(1.0, item.state) for item in changes.recordings]
-    return np.stack([unknown if item is None else np.stack((item.mean, item.scatter))
-                     for item in known], axis=1)
+    unknown = np.full((3, *monitor.layout.shape), np.nan)
+    found = np.stack([unknown] * len(changes.recordings), axis=1)
+    for place, item in enumerate(changes.recordings):
+        known = monitor.baseline(1.0, item.state)
+        mean = item.means.get(monitor.shaft)
+        fitted = mean and mean.fitted(monitor.layout)
+        if fitted is not None:
+            found[0, place] = fitted.values
+        if known is not None:
+            found[1:, place] = known.mean, np.sqrt(known.variance)
+    return found
 
 
-def _chosen(changes: Changes, levels: Mapping[str, Array]) -> list[Key]:
+def _chosen(changes: Changes, trends: Mapping[str, Array]) -> list[Key]:
     """Return the quantities that are drawn."""
     keys = [(item.shaft, item.channel, *item.quantity) for item in changes.limits.passed()]
     keys += [key_of(item) for item in changes.changes]
-    far = []
-    for shaft, monitor in changes.monitors.items():
-        for channel in range(monitor.layout.channels):
-            for quantity in monitor.layout.quantities:
-                key = shaft, channel, *quantity
-                values, mean, scatter = _trend(changes, key, levels)
-                late = (np.abs(values - mean) / scatter)[~np.array(changes.baseline)]
-                if np.isfinite(late).any():
-                    far.append((float(np.nanmedian(late)), key))
+    far: list[tuple[float, Key]] = []
+    for shaft, trend in trends.items():
+        values, mean, scatter = trend[:, ~np.array(changes.baseline)]
+        late = np.ma.masked_invalid(np.abs(values - mean) / scatter)
+        middle = np.ma.filled(np.ma.median(late, axis=0), np.nan)  # type: ignore[no-untyped-call]
+        far += [(float(size), (shaft, channel, *quantity))
+                for channel, row in enumerate(middle)
+                for size, quantity in zip(row, changes.monitors[shaft].layout.quantities)
+                if np.isfinite(size)]
     return [*dict.fromkeys([*keys, *(key for _, key in sorted(far, reverse=True))])][:_PANELS]
 
 
-def _trend(changes: Changes, key: Key, levels: Mapping[str, Array]) -> tuple[Array, Array, Array]:
-    """Return the values of all recordings, and mean and scatter of the baseline of each."""
-    shaft, channel, *quantity = key
-    monitor = changes.monitors[shaft]
-    place = monitor.layout.quantities.index(tuple(quantity))
-    rows = [item.means[shaft].fitted(monitor.layout) if shaft in item.means else None
-            for item in changes.recordings]
-    values = np.array([np.nan if row is None else row.values[channel, place] for row in rows])
-    mean, scatter = levels[shaft][:, :, channel, place]
-    return values, mean, scatter
-
-
-def _draw(axes: Axes, changes: Changes, key: Key, levels: Mapping[str, Array]) -> None:
-    values, mean, scatter = _trend(changes, key, levels)
+def _draw(axes: Axes, changes: Changes, key: Key, trends: Mapping[str, Array]) -> None:
     shaft, channel, kind, name = key
+    layout = changes.monitors[shaft].layout
+    place = layout.quantities.index((kind, name))
+    values, mean, scatter = trends[shaft][:, :, channel, place]
 
     def unit(value: Array) -> Array:
         return np.sqrt(np.maximum(value, 0.0)) if kind == 'order' else np.exp(value)
@@ -104,10 +101,8 @@ def _draw(axes: Axes, changes: Changes, key: Key, levels: Mapping[str, Array]) -
                       label='its mean ± 2 standard deviations')
     axes.step(number, middle, where='mid', color='tab:blue', linewidth=0.8)
     axes.plot(number, unit(values), '.-', color=MEASURED, linewidth=0.6, markersize=4.0)
-    layout = changes.monitors[shaft].layout
-    draw_limits(axes, [(level, bound * middle if relative else bound)
-                       for level, bound, relative in changes.limits.bounds(
-                           shaft, layout, channel, layout.quantities.index((kind, name)))])
+    draw_limits(axes, [(level, bound * middle if relative else bound) for level, bound, relative
+                       in changes.limits.bounds(shaft, layout, channel, place)])
     title = f'{changes.monitors[shaft].words(kind, name)} of {shaft}, channel {channel}'
     change = next((item for item in changes.changes if key_of(item) == key), None)
     if change is not None:

@@ -16,28 +16,27 @@ temperature, and show nothing of how the machine scatters from recording to reco
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import memory_of
 from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import KINDS, mean_of, monitored, MonitoredAverage
-from sa_jitter_ros.offline.files import read_averages, Signals, waveforms, write_lines
+from sa_jitter_ros.offline.files import read_averages, Signals, waveforms
 from sa_jitter_ros.offline.series import ShaftSeries
-from sa_jitter_ros.offline.settings import section
-from sa_jitter_ros.parameter_file import value_of
-from sa_jitter_ros.parameters import listed
+from sa_jitter_ros.offline.settings import section, values_of
+from sa_jitter_ros.parameters import converted, listed
+from sa_jitter_ros.whole_files import whole_file
 
 CHANGES, FIGURE = 'changes.json', 'changes.png'
 MONITOR = 'change_monitor'
@@ -108,7 +107,7 @@ class Changes:
 
     def report(self) -> dict[str, Any]:
         """Return the content of `changes.json`."""
-        found: dict[str, Any] = json_values({
+        return {
             'baseline': {'averages': self.learning, 'complete': all(
                 monitor.is_complete for monitor in self.monitors.values())},
             'changes': [*(self._content(item, self.since(item)) for item in self.limits.passed()),
@@ -116,13 +115,12 @@ class Changes:
                           for item in self.changes)],
             'events': list(self.events),
             'recordings': [item.name for item in self.recordings],
-            'left_out': dict(self.left_out)})
-        return found
+            'left_out': dict(self.left_out)}
 
     def write(self, output: Path) -> None:
         """Write `changes.json`; raises OSError."""
-        text = json.dumps(self.report(), indent=1, allow_nan=False)
-        write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
+        with whole_file(output / CHANGES) as file:
+            file.write(json_text(self.report()))
 
     def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
         return {**item.content(), 'channel': self.recordings[0].channels[item.channel],
@@ -173,12 +171,8 @@ def settings_of(params: Path | None, given: Sequence[str], learning: int) -> Set
 
     They are those of `change_monitor` in a machine file, and of texts `NAME:=VALUE`.
     """
-    values = {name: value for name, value in section(params, MONITOR).items() if name in SETTINGS}
-    for text in given:
-        name, _, value = text.partition(':=')
-        values[name] = value_of(value)
-    return Settings(learning_averages=learning, group_averages=1, **{
-        name: SETTINGS[name].convert(value) for name, value in values.items()})
+    return Settings(learning_averages=learning, group_averages=1, **converted(
+        section(params, MONITOR) | values_of(given), SETTINGS))
 
 
 def find_changes(output: Path, names: Sequence[str], settings: Settings,
@@ -194,27 +188,28 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings,
     orders = _common_orders(series for _, series, _ in averaged)
     recorded = [_recorded(output, name, signals, series, orders, settings, state)
                 for name, (signals, series, _) in zip(names, averaged)]
-    left_out = {item.name: item.reason for item in recorded if item.reason}
-    recorded = [item for item in recorded if not item.reason]
+    left_out: dict[str, str] = {}
+
+    def compared(reason: Callable[[Recorded], str]) -> list[Recorded]:
+        """Return the recordings that no reason leaves out."""
+        left_out.update((item.name, text) for item in recorded if (text := reason(item)))
+        return [item for item in recorded if item.name not in left_out]
+
+    recorded = compared(lambda item: item.reason)
     if not recorded:
         raise _too_few(recorded, settings, left_out)
     usual, _ = Counter(item.channels for item in recorded).most_common(1)[0]
-    for item in recorded:
-        if item.channels != usual:
-            left_out[item.name] = (f'has the channels {listed(item.channels)}, most have '
-                                   f'{listed(usual)}')
-    recorded = [item for item in recorded if item.name not in left_out]
+    recorded = compared(lambda item: '' if item.channels == usual else (
+        f'has the channels {listed(item.channels)}, most have {listed(usual)}'))
     apart = _in_time(recorded)
     recorded = apart or recorded
     learnt = [item for item, known in zip(recorded, _baseline(recorded, settings)) if known]
     speeds = [item.speed for item in learnt]
     low, high = min(speeds), max(speeds)
-    for item in recorded:
-        if not low / (1.0 + settings.speed_bin) <= item.speed <= high * (1.0 + settings.speed_bin):
-            left_out[item.name] = (f'turns at {item.speed:.4g} Hz, the baseline at {low:.4g} to '
-                                   f'{high:.4g} Hz: a longer baseline, or a larger speed_bin, '
-                                   'compares it')
-    recorded = [item for item in recorded if item.name not in left_out]
+    most = 1.0 + settings.speed_bin
+    recorded = compared(lambda item: '' if low / most <= item.speed <= high * most else (
+        f'turns at {item.speed:.4g} Hz, the baseline at {low:.4g} to {high:.4g} Hz: a longer '
+        'baseline, or a larger speed_bin, compares it'))
     if all(_baseline(recorded, settings)):
         raise _too_few(recorded, settings, left_out)
     return _watched(recorded, left_out, settings, machine, clock=bool(apart))

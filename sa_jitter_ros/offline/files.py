@@ -17,16 +17,13 @@ with a machine by its parts, `part` is the one that makes the order; the last co
 why an order has no amplitude.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
 import csv
 from dataclasses import asdict, dataclass, field, fields
 import json
 import math
-import os
 from pathlib import Path
 import shutil
-import tempfile
 from typing import Any, TextIO, TypeVar
 
 import numpy as np
@@ -38,16 +35,15 @@ from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
 from sa_jitter_ros.tacholess.recording import Tacholess
+from sa_jitter_ros.whole_files import TEMPORARY, whole_file
 
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
-TEMPORARY = '.averages.'  # prefix of folders whose files are not finished
 
 _HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycles',
            'fundamental_cycles', 'discarded_cycles')
 _OVER_ANGLE = ('_waveform', '_average', '_standard_error', '_spectrum')  # ends of names
 _COLUMNS = ('recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
             'trigger_cycles', 'discarded_cycles', 'channel')
-_WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles')
 
 
 @dataclass(frozen=True)
@@ -56,6 +52,7 @@ class RecordingJob:
     One recording to work on: its `name` in the results, its `path`, the folder of its files.
 
     `options` are keywords of `read`. With `tacholess` the pulses are found in the vibration.
+    `error` says why it cannot be used beside the others.
     """
 
     name: str
@@ -63,9 +60,12 @@ class RecordingJob:
     folder: str
     options: Mapping[str, Any] = field(default_factory=dict)
     tacholess: Tacholess | None = None
+    error: str = ''
 
     def settings(self, **others: Any) -> dict[str, Any]:
         """Return all that decides the files, as values of JSON; raises RecordingError."""
+        if self.error:
+            raise RecordingError(self.error)
         found: dict[str, Any] = json_values({
             'files': stamp(Path(self.path)), 'path': self.path, 'options': self.options,
             'tacholess': self.tacholess and asdict(self.tacholess), **others})
@@ -111,28 +111,11 @@ class Signals:
 
     def label(self, channel: int) -> str:
         """Return name and unit of the channel in this place, for an axis."""
-        unit = self.units[channel] if channel < len(self.units) else ''
-        return f'{self.channel_names[channel]}\n[{unit or "unit unknown"}]'
+        return f'{self.channel_names[channel]}\n[{self.unit_of([channel])}]'
 
-
-@contextmanager
-def finished_together(folder: Path) -> Iterator[Path]:
-    """
-    Yield a temporary folder, whose files get their names in `folder` at the end, or not at all.
-
-    `averages.npz` is last: where it is, all others are.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY) as temporary:
-            place = Path(temporary, 'finished')
-            place.mkdir()
-            yield place
-            for path in sorted(place.iterdir(), key=lambda path: path.name == ARRAYS):
-                os.replace(path, folder / path.name)
-    finally:
-        with suppress(OSError):  # it holds something
-            folder.rmdir()
+    def unit_of(self, channels: Iterable[int]) -> str:
+        """Return the unit, or the units, of channels in some places, for an axis."""
+        return ' / '.join(sorted({self.units[place] for place in channels})) or 'unit unknown'
 
 
 def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries],
@@ -149,11 +132,9 @@ def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries]
         'channel_names': np.array(signals.channel_names), 'units': np.array(signals.units),
         'shafts': np.array([item.shaft for item in series]),
         'about': np.array(json.dumps(json_values(about), allow_nan=False))}
-    for name in _HEADER:
-        arrays[name] = _typed(name, series[0][name])
+    arrays |= {name: series[0][name] for name in _HEADER}
     for item in series:
-        arrays |= {f'{item.shaft}_{name}': _typed(name, array)
-                   for name, array in item.arrays.items()}
+        arrays |= {f'{item.shaft}_{name}': array for name, array in item.arrays.items()}
     np.savez(folder / ARRAYS, **arrays)
 
 
@@ -193,10 +174,6 @@ def waveforms(folder: Path, shaft: str) -> Array:
         return np.asarray(arrays[f'{shaft}_waveform'])
 
 
-def _typed(name: str, array: Any) -> Any:
-    return np.asarray(array).astype(int) if name in _WHOLE else array
-
-
 def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
     writer = csv.writer(file, lineterminator='\n')
     of_order = series[0]['order_amplitude_fields'].tolist()
@@ -205,7 +182,7 @@ def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) 
     for item in series:
         parts = [[signals.machine.name_of(item.shaft, order)] * len(named)
                  for order in item.orders.tolist()]
-        header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
+        header = {name: item[name].tolist() for name in _HEADER}
         for row, (table, notes) in enumerate(zip(item['order_amplitude'], item['note'].tolist())):
             start = [signals.recording, item.shaft, *(
                 header[name][row] for name in _COLUMNS[2:-1])]
@@ -213,15 +190,6 @@ def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) 
                                                    signals.units, table.tolist()):
                 writer.writerows([*start, channel, *values, name, unit, *part, note]
                                  for values, part, note in zip(orders, parts, notes))
-
-
-def write_lines(path: Path, lines: Callable[[TextIO], None]) -> None:
-    """Write a text file under a temporary name first; raises OSError."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=TEMPORARY) as temporary:
-        place = Path(temporary, path.name)
-        with place.open('w', encoding='utf-8', newline='') as file:
-            lines(file)
-        os.replace(place, path)
 
 
 def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[str, str]]
@@ -232,8 +200,8 @@ def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[st
     Its last column, `error`, is empty there; each of the `failures`, (name of a recording,
     reason), has a row of its own.
     """
-    def lines(file: TextIO) -> None:
-        columns: list[str] = []
+    columns: list[str] = []
+    with whole_file(path) as file:
         for folder in folders:
             with (folder / TABLE).open(encoding='utf-8', newline='') as part:
                 first = part.readline().rstrip('\n')
@@ -248,8 +216,6 @@ def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[st
             writer.writerow([*columns, 'error'])
         for name, reason in failures:
             writer.writerow([name, *[''] * (len(columns) - 1), reason])
-
-    write_lines(path, lines)
 
 
 def stamp(path: Path) -> list[list[Any]]:
@@ -268,15 +234,12 @@ def stamp(path: Path) -> list[list[Any]]:
 def write_rows(path: Path, rows: Sequence[Row]) -> list[Row]:
     """Write rows of recordings as a table, in the order of their names; return them so."""
     ordered = sorted(rows, key=lambda row: (row.recording, row.path))
-
-    def lines(file: TextIO) -> None:
+    with whole_file(path) as file:
         writer = csv.writer(file, lineterminator='\n')
         writer.writerow(item.name for item in fields(rows[0]))
         for row in ordered:
             writer.writerow('; '.join(value) if isinstance(value, tuple) else value
                             for value in asdict(row).values())
-
-    write_lines(path, lines)
     return ordered
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import warnings
 
 from sa_jitter_ros.errors import DataWarning, one_line, SaJitterError
-from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.loop import close_loop, Loop
 from sa_jitter_ros.machine import Machine
@@ -87,8 +87,7 @@ def loop_file(job: LoopJob) -> LoopRow:
         return LoopRow(job.name, job.path, error=str(error))
     loop.write(job.folder)
     row = _row(job, loop, tuple(one_line(item.message) for item in caught))
-    done.write_text(json.dumps(json_values({'settings': settings, 'row': asdict(row)}), indent=1,
-                               allow_nan=False) + '\n', encoding='utf-8')
+    done.write_text(json_text({'settings': settings, 'row': asdict(row)}), encoding='utf-8')
     return row
 
 

@@ -27,9 +27,10 @@ from sa_jitter_ros.machine import LEVELS
 from sa_jitter_ros.monitoring.quantities import best_amplitudes
 from sa_jitter_ros.number_text import HALF_95, measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
-from sa_jitter_ros.offline.files import read_averages, Signals, write_lines
+from sa_jitter_ros.offline.files import read_averages, Signals
 from sa_jitter_ros.offline.plotting import squared
 from sa_jitter_ros.offline.series import ShaftSeries
+from sa_jitter_ros.whole_files import whole_file
 
 PAGE = 'page.html'
 _CHANNELS, _ORDERS = 3, 10  # the strongest ones
@@ -55,7 +56,8 @@ def write_page(folder: Path, changes: Changes | None = None, *, place: Path | No
         for name, title in _FIGURES.items():
             parts += _picture(folder / f'{prefix}{name}.png', title)
     parts += _picture(folder / 'repairs.png', 'Repaired pulses')
-    write_lines(place, lambda file: file.writelines([page(signals.recording, parts)]))
+    with whole_file(place) as file:
+        file.write(page(signals.recording, parts))
 
 
 def _picture(path: Path, title: str, *, kind: str = 'wide') -> Iterator[str]:

@@ -128,11 +128,6 @@ class ShaftCollector:
         self._notes: list[list[str]] = []
         self._angles = 0
 
-    @property
-    def count(self) -> int:
-        """Return the number of averages so far."""
-        return len(self._headers)
-
     def add(self, results: Mapping[str, AverageMessage],
             refused: Mapping[float, str] | None = None) -> None:
         """
@@ -140,7 +135,7 @@ class ShaftCollector:
 
         `refused` are its orders without amplitude, by their reason.
         """
-        row = self.count
+        row = len(self._headers)
         self._notes.append([(refused or {}).get(order, '') for order in
                             results['order_amplitude'].values[0, :, 0].tolist()])
         self._headers.append(asdict(results['synchronous_average'].header))
@@ -164,7 +159,7 @@ class ShaftCollector:
         arrays: dict[str, Array] = {
             _HEADER.get(name, name): np.array([header[name] for header in self._headers])
             for name in (self._headers[0] if self._headers else ())}
-        arrays |= {name: spool.rows(self.count) for name, spool in self._spools.items()}
+        arrays |= {name: spool.rows(len(self._headers)) for name, spool in self._spools.items()}
         arrays['note'] = np.array(self._notes, dtype=np.str_)
         arrays['angle'] = np.arange(self._angles) / max(self._angles, 1)
         if self._pulses:

@@ -78,13 +78,7 @@ class MachineFile:
         if params is not None:
             values = read_parameters(params, AVERAGER)
             detector = section(params, DETECTOR)
-        overrides = {}
-        for text in given:
-            name, separator, value = text.partition(':=')
-            if not (separator and name):
-                raise ParameterError(f'parameter {text!r}: give NAME:=VALUE, as in '
-                                     'trigger_cycles:=60')
-            overrides[name] = value_of(value)
+        overrides = values_of(given)
         values |= overrides
         found = following(values)
         LimitWatch(Machine.among(values), found.get('shafts') or _SHAFTS.convert(
@@ -103,6 +97,17 @@ class MachineFile:
                    converted(detector, {item.name: item for item in DETECTOR_PARAMETERS}),
                    '' if params is None else str(params), unknown_names(values, known), parts,
                    str(values.get(HARDWARE_ID.name, '')))
+
+
+def values_of(given: Collection[str]) -> dict[str, Any]:
+    """Return the values of parameters by name that texts `NAME:=VALUE` give; ParameterError."""
+    found = {}
+    for text in given:
+        name, separator, value = text.partition(':=')
+        if not (separator and name):
+            raise ParameterError(f'parameter {text!r}: give NAME:=VALUE, as in trigger_cycles:=60')
+        found[name] = value_of(value)
+    return found
 
 
 def section(params: Path | None, node: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ topic is (`/rig/vibration` is `vibration`); a channel map can name others.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 import math
 from pathlib import Path
@@ -32,7 +32,7 @@ from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, FLOAT32, FLOAT64, IMU, SampleDecoder,
     TIME_REFERENCE, TIME_TOLERANCE)
 from sa_jitter_ros.recordings.recording import (
-    library, MAX_PULSES, rechunk, Recording, recording_errors)
+    library, MAX_PULSES, rechunk, Recording, recording_errors, SampleSource)
 from sa_jitter_ros.samples import SampleBlock
 
 _SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
@@ -42,24 +42,6 @@ _MAX_LOST = 1 << 29  # largest gap, in samples of all channels
 _SAME_RATE = 1e-6  # relative
 _IMU_AXES = 'xyz'
 _FILL = 65_536
-
-
-@dataclass(frozen=True)
-class BagSource:
-    """The samples of one topic; lost ones are NaN, repeated ones are skipped."""
-
-    path: Path
-    topic: str
-    sample_rate: float | None
-    channels: int
-    samples: int
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks."""
-        run = _BlockRun(self.topic)
-        with recording_errors(self.path), _reader(self.path) as reader:
-            messages = _blocks(reader, self.topic, self.sample_rate)
-            yield from rechunk(run.continuous(messages), samples_per_block)
 
 
 def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
@@ -196,14 +178,23 @@ def _type_of(reader: Any, topic: str) -> str:
 
 
 def _samples(reader: Any, path: Path, topic: str, sample_rate: float | None) -> Recording:
-    """Read a topic once and return its samples as a recording."""
+    """
+    Read a topic once and return its samples as a recording.
+
+    Lost ones are NaN, repeated ones are skipped.
+    """
+    def blocks(samples_per_block: int) -> Iterator[FloatArray]:
+        with recording_errors(path), _reader(path) as again:
+            messages = _blocks(again, topic, sample_rate)
+            yield from rechunk(_BlockRun(topic).continuous(messages), samples_per_block)
+
     run = _BlockRun(topic)
     for _ in run.continuous(_blocks(reader, topic, sample_rate)):
         pass
     if run.first is None:
         raise RecordingError(f'{topic} has no messages: record the topic')
     imu = _type_of(reader, topic) == IMU
-    source = BagSource(path, topic, sample_rate, len(run.first.samples), run.received)
+    source = SampleSource(len(run.first.samples), run.received, blocks)
     return Recording(source, run.first.sample_rate, tuple(_IMU_AXES) if imu else (),
                      ('m/s^2',) if imu else (), run.first.start_time, remarks=run.remarks())
 

@@ -16,7 +16,7 @@ Formats of measuring systems are such lists (`list_formats`).
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,14 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.fields import MOST_NAMED, some_of
+from sa_jitter_ros.recordings.recording import Recording, recording_errors, SampleSource
 
 Opened = Callable[[], AbstractContextManager[Any]]
 
 _SAME_START = 0.01  # of a sample
 _ROUNDED = 1e-4  # relative, of a rate in a file
 _UNEVEN = 0.5  # of a sample, by which times may be off a constant rate
-_MOST_NAMED = 12  # channels in a message
 
 
 @dataclass(frozen=True)
@@ -53,62 +53,53 @@ class Channel:
     read: Callable[[Any, int, int], FloatArray]
 
 
-@dataclass(frozen=True)
-class ChannelSource:
-    """The samples of channels that were sampled together; `opened` opens their file."""
+#: Channels of a file, why others are none, one sentence each, and what opens it.
+ChannelList = tuple[Sequence[Channel], Sequence[str], Opened]
 
-    path: Path
-    parts: tuple[Channel, ...]
-    opened: Opened
 
-    @property
-    def channels(self) -> int:
-        """Return the number of channels."""
-        return len(self.parts)
+def source_of(path: Path, parts: Sequence[Channel], opened: Opened) -> SampleSource:
+    """Return the samples of channels that were sampled together; `opened` opens their file."""
+    samples = parts[0].samples
 
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-        return self.parts[0].samples
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks, with the file open all the time."""
-        with recording_errors(self.path), self.opened() as file:
-            for start in range(0, self.samples, samples_per_block):
-                stop = min(start + samples_per_block, self.samples)
-                rows = [np.asarray(part.read(file, start, stop), np.float64)
-                        for part in self.parts]
+    def blocks(samples_per_block: int) -> Iterator[FloatArray]:  # the file is open all the time
+        with recording_errors(path), opened() as file:
+            for start in range(0, samples, samples_per_block):
+                stop = min(start + samples_per_block, samples)
+                rows = [np.asarray(part.read(file, start, stop), np.float64) for part in parts]
                 if any(row.shape != (stop - start,) for row in rows):
                     raise RecordingError(f'samples {start} to {stop} cannot be read: the file is '
                                          'truncated or broken; copy it again')
                 yield np.stack(rows)
 
+    return SampleSource(len(parts), samples, blocks)
 
-def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: ChannelMap,
-                 sample_rate: float | None, left_out: Sequence[str] = (),
-                 opened: Opened = nullcontext) -> Recording:
+
+def recording_of(path: Path, listed: ChannelList, *, channel_map: ChannelMap,
+                 sample_rate: float | None) -> Recording:
     """
     Return the recording of some channels of a file, in the roles that the map gives them.
 
     Without names of vibration it is all channels of one rate, start and length, those that hold
     the most samples. The tach may have a rate of its own. `sample_rate` is used for channels
-    without one, and in place of one that is rounded. `left_out` says why
-    other channels of the file are none, one sentence each; `opened` opens what they read from.
+    without one, and in place of one that is rounded.
 
     >>> acc, key = (Channel((name,), 'g', rate, 0.0, int(rate), lambda file, start, stop:
     ...             np.zeros(stop - start)) for name, rate in (('acc', 100.0), ('key', 500.0)))
-    >>> recording_of(Path(), [acc, key], channel_map=ChannelMap(tach='key'), sample_rate=None)
+    >>> from contextlib import nullcontext
+    >>> recording_of(Path(), ([acc, key], (), nullcontext), channel_map=ChannelMap(tach='key'),
+    ...              sample_rate=None)
     Recording('.', 1 channel of 100 samples at 100 Hz (1 s), tach at 500 Hz, ratio 1)
     """
-    channels = [channel for channel in channels if channel.samples]
+    every, left_out, opened = listed
+    channels = [channel for channel in every if channel.samples]
     names = _unique([channel.names for channel in channels])
     if not channels:
         raise RecordingError('; '.join(['no channel with samples at a constant rate',
-                                        *left_out[:_MOST_NAMED]]))
+                                        *left_out[:MOST_NAMED]]))
     try:
         chosen, tach = channel_map.roles(names)
     except RecordingError as error:
-        raise RecordingError('; '.join([str(error), *left_out[:_MOST_NAMED]])) from None
+        raise RecordingError('; '.join([str(error), *left_out[:MOST_NAMED]])) from None
     remarks = list(left_out)
     if not channel_map.vibration:
         together = Counter(_clock(channels[k]) for k in chosen)
@@ -117,9 +108,9 @@ def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: Channe
         chosen = tuple(k for k in chosen if _clock(channels[k]) == most)
         if others:
             remarks.append('left out, because they were not sampled with '
-                           f'{names[chosen[0]]}: {_listed(others)}')
+                           f'{names[chosen[0]]}: {some_of(others)}')
     if len({_clock(channels[k]) for k in chosen}) > 1:
-        raise RecordingError('channels of different rates, starts or lengths: ' + _listed([
+        raise RecordingError('channels of different rates, starts or lengths: ' + some_of([
             f'{names[k]} {channels[k].samples} samples at {channels[k].rate or 0.0:g} Hz'
             for k in chosen]) + '; choose those that were sampled together')
     first = channels[chosen[0]]
@@ -138,9 +129,9 @@ def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: Channe
             raise RecordingError(
                 f'{names[tach]} begins at {channels[tach].start:.9g} s and {names[chosen[0]]} at '
                 f'{first.start:.9g} s: export channels that begin together')
-        tach_source = ChannelSource(path, (channels[tach],), opened)
+        tach_source = source_of(path, [channels[tach]], opened)
     return Recording(
-        ChannelSource(path, tuple(channels[k] for k in chosen), opened), rate,
+        source_of(path, [channels[k] for k in chosen], opened), rate,
         start_time=first.start, channel_names=tuple(names[k] for k in chosen),
         units=tuple(channels[k].unit for k in chosen), tach=tach_source, tach_rate=tach_rate,
         remarks=tuple(remarks), path=str(path))
@@ -171,7 +162,3 @@ def _unique(names: Sequence[tuple[str, ...]]) -> list[str]:
     counts = Counter(name for several in names for name in dict.fromkeys(several))
     return [next((name for name in several if name and counts[name] == 1), str(number))
             for number, several in enumerate(names)]
-
-
-def _listed(texts: Sequence[str]) -> str:
-    return ', '.join(texts[:_MOST_NAMED]) + (', ...' if len(texts) > _MOST_NAMED else '')

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.recording import ChangedSource, Recording, SampleSource
+from sa_jitter_ros.recordings.recording import changed, Recording, SampleSource
 
 
-def rows_of(source: SampleSource, rows: Sequence[int]) -> ChangedSource:
+def rows_of(source: SampleSource, rows: Sequence[int]) -> SampleSource:
     """Return some channels of a source, in the order of `rows`."""
-    return ChangedSource(source, len(rows), itemgetter(list(rows)))
+    return changed(source, len(rows), itemgetter(list(rows)))
 
 
 def with_channels(recording: Recording, rows: Sequence[int]) -> Recording:

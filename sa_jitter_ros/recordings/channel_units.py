@@ -24,7 +24,7 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import fixed, Parameter
-from sa_jitter_ros.recordings.recording import ChangedSource, Recording
+from sa_jitter_ros.recordings.recording import changed, Recording
 
 #: Channels by name, each with `unit` and `sensitivity`, in the order of the machine file.
 Channels = Mapping[str, Mapping[str, Any]]
@@ -145,7 +145,7 @@ def in_units(recording: Recording, channels: Channels) -> Recording:
         for name, before, after, divisor in zip(scale.names, recording.units, scale.units,
                                                 scale.divisor)
         if divisor == 1.0 and before not in ('', '1') and before != after)
-    vibration = ChangedSource(recording.vibration, recording.channels, scale.apply)
+    vibration = changed(recording.vibration, recording.channels, scale.apply)
     return replace(recording, vibration=vibration,
                    channel_names=scale.names, units=scale.units,
                    remarks=(*recording.remarks, *remarks))

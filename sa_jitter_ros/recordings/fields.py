@@ -35,7 +35,7 @@ Arrays = tuple[Collection[str], Load]
 SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
 _PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
 _TEXT_FIELDS = ('channel_names', 'units', 'description')
-_MOST_NAMED = 12  # keys of a file in a message
+MOST_NAMED = 12  # keys of a file, or channels, in a message
 
 
 def size_limit(name: str) -> int:
@@ -108,8 +108,12 @@ def given_fields(fields: Mapping[str, Any], keys: Collection[str] = ()
 
 def shown_keys(keys: Collection[str]) -> str:
     """Return the keys of a file as a short text."""
-    some = sorted(keys)[:_MOST_NAMED]
-    return ', '.join(some) + (', ...' if len(keys) > len(some) else '') if some else 'none'
+    return some_of(sorted(keys)) or 'none'
+
+
+def some_of(texts: Sequence[str]) -> str:
+    """Return the first texts in one."""
+    return ', '.join(texts[:MOST_NAMED]) + (', ...' if len(texts) > MOST_NAMED else '')
 
 
 def recording_from_fields(arrays: Arrays, *, acquisition: int, given: Mapping[str, Any],

@@ -20,7 +20,7 @@ line, else node and direction (`7:+Z`), else its number.
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,27 +28,21 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
-from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.channel_list import Channel, ChannelList, constant_rate
 from sa_jitter_ros.recordings.limits import MAX_VALUES
-from sa_jitter_ros.recordings.recording import library, Recording
+from sa_jitter_ros.recordings.recording import library
 
 _FUNCTION, _GENERAL, _TIME_RESPONSE = 58, 0, 1
 _DIRECTIONS = {1: '+X', 2: '+Y', 3: '+Z', -1: '-X', -2: '-Y', -3: '-Z'}
 
 
-def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
-    """
-    Open a `.tdms` file; `sample_rate` is used for channels whose rate the file does not say.
-
-    Raises RecordingError if npTDMS is not installed or the file is broken.
-    """
+def open_tdms(path: Path) -> ChannelList:
+    """Open a `.tdms` file; RecordingError if npTDMS is not installed or the file is broken."""
     with _opened_tdms(path) as file:
         channels = [_tdms_channel(group.name, channel)
                     for group in file.groups() for channel in group.channels()
                     if channel.dtype is not None and channel.dtype.kind in 'fiub']
-    return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                        opened=partial(_opened_tdms, path))
+    return channels, [], partial(_opened_tdms, path)
 
 
 @contextmanager
@@ -67,7 +61,7 @@ def _tdms_channel(group: str, channel: Any) -> Channel:
                    lambda file, start, stop: file[group][name][start:stop])
 
 
-def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
+def open_mdf(path: Path) -> ChannelList:
     """
     Open a `.mf4` or `.mdf` file, whose times give the rates.
 
@@ -78,8 +72,7 @@ def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
     left_out: list[str] = []
     with asammdf.MDF(path) as file:
         channels = list(_mdf_channels(file, left_out))
-    return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                        left_out=left_out, opened=partial(asammdf.MDF, path))
+    return channels, left_out, partial(asammdf.MDF, path)
 
 
 def _mdf_channels(file: Any, left_out: list[str]) -> Iterator[Channel]:
@@ -115,7 +108,7 @@ def _mdf_samples(group: int, index: int, file: Any, start: int, stop: int) -> Fl
                                record_count=stop - start).samples, np.float64)
 
 
-def open_uff(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
+def open_uff(path: Path) -> ChannelList:
     """
     Open a universal file; its samples are read into memory.
 
@@ -128,8 +121,7 @@ def open_uff(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
                              f'{8 * MAX_VALUES} are read; export .tdms, .mat or .wav')
     left_out: list[str] = []
     channels = list(_uff_channels(pyuff.UFF(str(path)), left_out))
-    return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                        left_out=left_out)
+    return channels, left_out, nullcontext
 
 
 def _uff_channels(file: Any, left_out: list[str]) -> Iterator[Channel]:

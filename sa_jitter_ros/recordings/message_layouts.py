@@ -33,16 +33,15 @@ TIME_REFERENCE = 'sensor_msgs/TimeReference'
 INDEX_BASE = 1 << 24  # largest power of two below which every integer is a float32
 _LARGEST = 1 << 32  # elements, also of the shape of an empty array: a limit of numpy
 TIME_TOLERANCE = 0.01  # s; a clock that jumps back by more starts a new run
-# Of `StampCounter`: delay against the clock, in samples, that jitter of 0.7 samples does not
-# cause.
+# Delay against the clock, in samples, that jitter of 0.7 samples does not cause.
 _LOSS = 0.75
 # Fraction of a deviation by which the clock is corrected: at a rate 3 % off it lags by 0.6
 # samples.
 _FOLLOW = 0.05
 # Sum of delays, in variances, that white jitter causes once in 1e8 stamps.
 _EVIDENCE = 13.0
-# Of `StampRate`: stamps that are compared, and the least number of them; the relative difference
-# of rates that loses no sample; a usual interval, in mean ones, that shows bursts.
+# Stamps that are compared with the rate, and the least number of them; the relative difference of
+# rates that loses no sample; a usual interval, in mean ones, that shows bursts.
 _COMPARED, _ENOUGH = 256, 64
 _SAME = 0.03
 _BURST = 0.5
@@ -145,24 +144,30 @@ class StampCounter:
     >>> counter = StampCounter(100.0)
     >>> [counter.index(time) for time in (0.0, 0.01, 0.02, 0.05, 0.06)]
     [0, 1, 2, 5, 6]
+    >>> counter = StampCounter(400.0)
+    >>> for number in range(100):
+    ...     _ = counter.index(number / 150.0)
+    >>> counter.doubt()
+    'its stamps come 150 times a second, sample_rate declares 400 Hz: set sample_rate to 150'
     """
 
     def __init__(self, sample_rate: float) -> None:
         self.restarts = 0
         self._rate = sample_rate
-        self._last: float | None = None  # stamp
+        self._stamps: deque[float] = deque(maxlen=_COMPARED)  # the latest
         self._start(0.0)
 
     def _start(self, time: float) -> None:
+        self._stamps.clear()
         self._index, self._expected = 0, time
         self._late, self._variance = 0.0, 0.01  # samples and samples^2, against the clock
         self._surplus, self._doubtful = 0.0, 0  # lateness, and of how many stamps
 
     def index(self, time: float) -> int:
         """Return the index of the next sample, stamped `time` (s)."""
-        if self._last is None:
+        if not self._stamps:
             self._start(time)
-        elif time < self._last - max(TIME_TOLERANCE, 1.0 / self._rate):
+        elif time < self._stamps[-1] - max(TIME_TOLERANCE, 1.0 / self._rate):
             self.restarts += 1
             self._start(time)
         late = (time - self._expected) * self._rate
@@ -177,34 +182,13 @@ class StampCounter:
         self._variance += gain * (0.5 * (late - self._late)**2 - self._variance)
         late -= lost
         found = self._index + lost
-        self._index, self._late, self._last = found + 1, late, time
+        self._index, self._late = found + 1, late
+        self._stamps.append(time)
         self._expected += (lost + 1 + gain * late) / self._rate
         return found
 
-
-class StampRate:
-    """
-    Compares the stamps of the latest samples with a declared `sample_rate` (Hz).
-
-    >>> stamps = StampRate(400.0)
-    >>> for number in range(100):
-    ...     stamps.add(number / 150.0)
-    >>> stamps.doubt()
-    'its stamps come 150 times a second, sample_rate declares 400 Hz: set sample_rate to 150'
-    """
-
-    def __init__(self, sample_rate: float) -> None:
-        self._rate = sample_rate
-        self._stamps: deque[float] = deque(maxlen=_COMPARED)
-
-    def add(self, time: float) -> None:
-        """Take the stamp (s) of the next sample."""
-        if self._stamps and time < self._stamps[-1] - max(TIME_TOLERANCE, 1.0 / self._rate):
-            self._stamps.clear()
-        self._stamps.append(time)
-
     def doubt(self) -> str:
-        """Return what is wrong with the stamps, '' if nothing is, or if there are few of them."""
+        """Return why the stamps do not fit the rate, '' if they do or are few."""
         if len(self._stamps) < _ENOUGH or not self._stamps[-1] > self._stamps[0]:
             return ''
         intervals = np.diff(self._stamps)
@@ -245,7 +229,6 @@ class SampleDecoder:
         self._axes = tuple(imu_axis)
         self._next_index = 0
         self._stamps, self._imu_index = StampCounter(sample_rate), 0
-        self._stamp_rate = StampRate(sample_rate)
         self._imu_last: tuple[float, ...] = ()
         self.counted = False
 
@@ -257,7 +240,7 @@ class SampleDecoder:
     @property
     def doubt(self) -> str:
         """Return why the stamps of Imu messages do not fit `sample_rate`, '' if they do."""
-        return self._stamp_rate.doubt()
+        return self._stamps.doubt()
 
     def decode(self, message: Any) -> SampleBlock:
         """Return the block of samples in a message."""
@@ -311,7 +294,6 @@ class SampleDecoder:
         values = tuple(float(getattr(vector, axis)) for axis in self._axes)
         if (time, *values) != self._imu_last:  # a repeated message keeps its index
             self._imu_index = self._stamps.index(time)
-            self._stamp_rate.add(time)
         self._imu_last = time, *values
         return SampleBlock(np.array(values)[:, None], time, rate, self._imu_index)
 

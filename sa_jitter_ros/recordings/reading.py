@@ -20,6 +20,7 @@ from typing import Any
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.parameters import fixed
 from sa_jitter_ros.recordings.bag_format import open_bag
+from sa_jitter_ros.recordings.channel_list import recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.channel_units import Channels, channels_of, in_units, PREFIX
 from sa_jitter_ros.recordings.csv_format import open_csv
@@ -31,8 +32,8 @@ from sa_jitter_ros.recordings.npz_format import npz_arrays
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 from sa_jitter_ros.recordings.wav_format import open_wav
 
-_LISTS = {'.csv': open_csv, '.tdms': open_tdms, '.mf4': open_mdf, '.mdf': open_mdf,
-          '.uff': open_uff, '.unv': open_uff}  # what opens files that are lists of channels
+_LISTS = {'.tdms': open_tdms, '.mf4': open_mdf, '.mdf': open_mdf, '.uff': open_uff,
+          '.unv': open_uff}  # what opens files that are lists of channels
 #: Keywords of `read` that commands and the recording player take, too.
 READ_PARAMETERS = (
     fixed('acquisition', 0, 'acquisition to read, from 0, of several in a file', minimum=0),
@@ -43,7 +44,7 @@ READ_PARAMETERS = (
     fixed('tach_channel', '', 'name or number of the tach waveform'),
     fixed('time_column', '', 'name or number of the column of times in a .csv'),
 )
-SUFFIXES = ('.npz', '.mat', '.wav', *_LISTS, '.mcap', '.db3')
+SUFFIXES = ('.npz', '.mat', '.wav', '.csv', *_LISTS, '.mcap', '.db3')
 
 
 def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
@@ -134,12 +135,12 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
             if suffix == '.wav':
                 recording = channel_map.select(replace(open_wav(path), **given))
             else:
-                rate = given.pop('sample_rate', None)
+                how: dict[str, Any] = {
+                    'channel_map': channel_map, 'sample_rate': given.pop('sample_rate', None)}
                 recording = replace(
-                    _LISTS[suffix](path, channel_map=channel_map, sample_rate=rate)
-                    if suffix in _LISTS else open_bag(
-                        path, channel_map=channel_map, sample_rate=rate, keyphasor=keyphasor),
-                    **given)
+                    recording_of(path, _LISTS[suffix](path), **how) if suffix in _LISTS else
+                    open_csv(path, **how) if suffix == '.csv' else
+                    open_bag(path, keyphasor=keyphasor, **how), **given)
         if not 0 <= acquisition < recording.acquisitions:
             raise RecordingError(f'acquisition {acquisition}: the file has '
                                  f'{recording.acquisitions}, numbered from 0')

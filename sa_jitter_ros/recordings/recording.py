@@ -13,10 +13,11 @@
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 import math
 from pathlib import Path
 import tempfile
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -32,41 +33,37 @@ _LONGEST = 500  # characters of an error that may quote a recording
 MAX_PULSES = 50_000_000
 
 
-class SampleSource(Protocol):
-    """Samples of one or more channels that can be read again and again, block by block."""
+@dataclass(eq=False)
+class SampleSource:
+    """
+    Samples of one or more `channels` that can be read again and again, block by block.
 
-    @property
-    def channels(self) -> int:
-        """Return the number of channels."""
+    `blocks` iterates over them, `channel` x `sample`: all blocks but the last have the number of
+    samples that it is called with. `samples` is the number of all of a channel.
+    """
 
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks; all but the last have this length."""
+    channels: int
+    samples: int
+    blocks: Callable[[int], Iterator[FloatArray]]
 
 
-@dataclass(frozen=True, eq=False)
-class ArraySource:
+class ArraySource(SampleSource):
     """Samples of an array or a memory map (`channel` x `sample`, any real dtype)."""
 
-    array: Array
+    def __init__(self, array: Array) -> None:
+        self.array = array
+        super().__init__(int(array.shape[0]), int(array.shape[1]), partial(_parts_of, array))
 
-    @property
-    def channels(self) -> int:
-        """Return the number of channels."""
-        return int(self.array.shape[0])
 
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-        return int(self.array.shape[1])
+def _parts_of(array: Array, samples_per_block: int) -> Iterator[FloatArray]:
+    for start in range(0, array.shape[1], samples_per_block):
+        yield np.array(array[:, start:start + samples_per_block], dtype=np.float64)
 
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks as float64."""
-        for start in range(0, self.samples, samples_per_block):
-            yield np.array(self.array[:, start:start + samples_per_block], dtype=np.float64)
+
+def changed(source: SampleSource, channels: int, change: Callable[[FloatArray], FloatArray]
+            ) -> SampleSource:
+    """Return another source, each of whose blocks is changed: into one of so many `channels`."""
+    return SampleSource(channels, source.samples, lambda count: map(change, source.blocks(count)))
 
 
 def mapped(pieces: Iterable[bytes], dtype: DTypeLike) -> NDArray[Any]:
@@ -75,24 +72,6 @@ def mapped(pieces: Iterable[bytes], dtype: DTypeLike) -> NDArray[Any]:
         spool.writelines(pieces)
         spool.flush()
         return np.memmap(spool, dtype, 'r')
-
-
-@dataclass(frozen=True, eq=False)
-class ChangedSource:
-    """Another source, each of whose blocks is changed: into one of so many `channels`."""
-
-    source: SampleSource
-    channels: int
-    change: Callable[[FloatArray], FloatArray]
-
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-        return self.source.samples
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks."""
-        return map(self.change, self.source.blocks(samples_per_block))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ neither 24-bit samples nor a data chunk that was cut short.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 import os
 from pathlib import Path
 import struct
@@ -24,46 +24,38 @@ import struct
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording, recording_errors, SampleSource
 
 _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
 _WIDTHS = {_PCM: (8, 16, 24, 32), _FLOAT: (32, 64)}
 
 
-@dataclass(frozen=True)
-class WavSource:
-    """The samples of a `.wav` file; integers are scaled so that full scale is 1."""
+def _blocks(path: Path, offset: int, channels: int, samples: int, coding: int, bits: int,
+            samples_per_block: int) -> Iterator[FloatArray]:
+    """Iterate over `channel` x `sample` blocks."""
+    frame = channels * bits // 8
+    with recording_errors(path), open(path, 'rb') as file:
+        file.seek(offset)
+        for start in range(0, samples, samples_per_block):
+            count = min(samples_per_block, samples - start)
+            data = file.read(count * frame)
+            if len(data) != count * frame:
+                raise RecordingError(f'ends inside sample {start + len(data) // frame}: it was '
+                                     'cut while it was read; open it again')
+            yield _decoded(data, coding, bits).reshape(count, channels).T
 
-    path: Path
-    offset: int
-    channels: int
-    samples: int
-    bits: int
-    is_float: bool
 
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks."""
-        frame = self.channels * self.bits // 8
-        with recording_errors(self.path), open(self.path, 'rb') as file:
-            file.seek(self.offset)
-            for start in range(0, self.samples, samples_per_block):
-                count = min(samples_per_block, self.samples - start)
-                data = file.read(count * frame)
-                if len(data) != count * frame:
-                    raise RecordingError(f'ends inside sample {start + len(data) // frame}: it '
-                                         'was cut while it was read; open it again')
-                yield self._decode(data).reshape(count, self.channels).T
-
-    def _decode(self, data: bytes) -> FloatArray:
-        if self.is_float:
-            return np.frombuffer(data, f'<f{self.bits // 8}').astype(np.float64)
-        if self.bits == 8:
-            return (np.frombuffer(data, np.uint8) - 128.0) / 128
-        if self.bits == 24:  # put each sample into the upper three bytes of a 32-bit integer
-            wide = np.zeros((len(data) // 3, 4), np.uint8)
-            wide[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
-            return wide.view('<i4')[:, 0] / 2.0**31
-        return np.frombuffer(data, f'<i{self.bits // 8}') / 2.0**(self.bits - 1)
+def _decoded(data: bytes, coding: int, bits: int) -> FloatArray:
+    """Return samples; integers are scaled so that full scale is 1."""
+    if coding == _FLOAT:
+        return np.frombuffer(data, f'<f{bits // 8}').astype(np.float64)
+    if bits == 8:
+        return (np.frombuffer(data, np.uint8) - 128.0) / 128
+    if bits == 24:  # put each sample into the upper three bytes of a 32-bit integer
+        wide = np.zeros((len(data) // 3, 4), np.uint8)
+        wide[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
+        return wide.view('<i4')[:, 0] / 2.0**31
+    return np.frombuffer(data, f'<i{bits // 8}') / 2.0**(bits - 1)
 
 
 def open_wav(path: Path) -> Recording:
@@ -96,7 +88,8 @@ def open_wav(path: Path) -> Recording:
         offset = file.tell()
         available = min(size, os.fstat(file.fileno()).st_size - offset)
         samples = available // (channels * bits // 8)
-        source = WavSource(path, offset, channels, samples, bits, coding == _FLOAT)
+        source = SampleSource(channels, samples, partial(
+            _blocks, path, offset, channels, samples, coding, bits))
         remarks = () if available == size else (
             f'the data chunk should have {size} bytes and has {available}: it was read up to its '
             'end',)

@@ -12,16 +12,15 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
-import json
 from pathlib import PurePath
 from typing import Any
 
 from sa_jitter_ros.html_parts import figure, kept, page, part, table
 from sa_jitter_ros.inference.trace_result import Trace
+from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.number_text import measured_text, order_text, percent_text
 from sa_jitter_ros.report.figures import illustrate, Illustration
-from sa_jitter_ros.report.new_section import ONLY_SHAFT
-from sa_jitter_ros.report.report import parameter_unit
+from sa_jitter_ros.report.report import ONLY_SHAFT, parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 
 Json = Any
@@ -29,6 +28,8 @@ Json = Any
 _TITLE = 'Keyphasor jitter: measured against predicted'
 _UNITS = {'keyphasor_rate': 'Hz', 'trigger_speed': 'Hz', 'sample_rate': 'Hz', 'jitter_std': 's',
           'jitter_table': 's'}
+_SHARES = ('measured', 'as declared', 'as found')  # of the true amplitude, heads of columns
+_BOUNDS = (('at least', 'lower_95'), ('at most', 'upper_95'))
 _ERRORS = (
     ('rms', 'RMS of observed minus predicted attenuation'),
     ('rms_standard_error', 'standard error that the RMS contains (in quadrature)'),
@@ -43,7 +44,7 @@ def report_files(trace: Trace, content: Mapping[str, Json]) -> Mapping[str, byte
     """Return all files of a report by name; `content` is that of `report.json`."""
     figures = illustrate(trace)
     pictures = {f'{item.name}.png': item.png() for item in figures}
-    return {'report.json': _json(content),
+    return {'report.json': json_text(content, 2).encode(),
             'report.html': html(content, figures, pictures).encode(), **pictures}
 
 
@@ -59,7 +60,7 @@ def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, b
     for shaft, item in shafts.items():
         parts += [f'<h2><a href="{escape(shaft)}/report.html">Shaft {escape(shaft)}</a></h2>',
                   _verdict(item)]
-    return {'report.json': _json(content),
+    return {'report.json': json_text(content, 2).encode(),
             'report.html': page(f'Report: {content["verdict"]}', parts).encode(),
             **{f'{shaft}/{name}': data for shaft, each in files.items()
                for name, data in each.items()}}
@@ -73,10 +74,6 @@ def html(content: Mapping[str, Json], figures: Sequence[Illustration],
         *_amplitudes(content), *_steps(content),
         *(figure(item.title, pictures[f'{item.name}.png'], item.caption) for item in figures),
         '<h2>Evidence</h2>', *_evidence(content)])
-
-
-def _json(content: Mapping[str, Json]) -> bytes:
-    return (json.dumps(content, indent=2, allow_nan=False) + '\n').encode()
 
 
 # --- for five minutes ----------------------------------------------------------------------------
@@ -123,12 +120,10 @@ def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
         return
     against = ('those of the better keyphasor'
                if content['against'] == 'reference keyphasor' else 'the corrected amplitudes')
-    added = bool(content['missing_effects'])
+    shown = 3 if content['missing_effects'] else 2
     yield '<h2>What it does to the amplitudes</h2>'
-    yield table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
-        (order_text(item.order, item.name), percent_text(item.observed, item.standard_error),
-         *(percent_text(value, item.standard_error, shown=False)
-           for value in (item.before, *((item.after,) if added else ())))) for item in shares])
+    yield table(('order', *_SHARES[:shown]), [
+        (order_text(item['order'], item['name']), *_shares(item)[:shown]) for item in shares])
     yield ('<p class="quiet">Share of the true amplitude that an average keeps, with one standard '
            f'error; the mean over the channels, of {content["acquisitions"]["held_out"]} averages '
            f'that served no fit. Measured against {against}.</p>')
@@ -182,27 +177,25 @@ def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
 
 def _limit_table(content: Mapping[str, Json]) -> str:
     return table(('effect', 'parameter', 'at 95 %'), [
-        (item['name'], item['parameter'], ' and '.join(filter(None, (
-            bound and f'{word} {bound}' for word, bound in (
-                ('at least', _bound(item, 'lower_95', content)),
-                ('at most', _bound(item, 'upper_95', content)))))) or '–')
-        for item in content['limits']])
-
-
-def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> str:
-    return '' if item[key] is None else measured_text(item[key], None, parameter_unit(
-        item['name'], item['parameter'], item['unit'], content['unit']))
+        (item['name'], item['parameter'], ' and '.join(
+            f'{word} {measured_text(item[key], None, unit)}' for word, key in _BOUNDS
+            if item[key] is not None) or '–')
+        for item in content['limits'] for unit in [parameter_unit(
+            item['name'], item['parameter'], item['unit'], content['unit'])]])
 
 
 def _line_table(content: Mapping[str, Json]) -> str:
     return table(
-        ('order', 'channel', 'amplitude', 'measured', 'as declared', 'as found'),
+        ('order', 'channel', 'amplitude', *_SHARES),
         [(order_text(item['order'], item['name']), item['channel'],
-          measured_text(item['level'], None, content['unit']),
-          percent_text(item['observed'], item['standard_error']),
-          *(percent_text(item[key], item['standard_error'], shown=False)
-            for key in ('predicted_before', 'predicted_after')))
+          measured_text(item['level'], None, content['unit']), *_shares(item))
          for item in content['lines']], kind='cards')
+
+
+def _shares(item: Mapping[str, Json]) -> Sequence[str]:
+    """Return the texts of `_SHARES` of a line."""
+    return [percent_text(item[key], item['standard_error'], shown=key == 'observed')
+            for key in ('observed', 'predicted_before', 'predicted_after')]
 
 
 def _declared_table(content: Mapping[str, Json]) -> str:

@@ -11,7 +11,6 @@
 """What a report says in plain words: what was found, what it does to amplitudes, what to do."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,34 +21,22 @@ from sa_jitter_ros.report.report import change_text, other_numbers, parameters_t
 Json = Any
 
 _LOSS = 0.05  # of an amplitude, from which on correction is worth its work
+_MEANS = ('observed', 'standard_error', 'predicted_before', 'predicted_after')
 _LARGEST = 0.01  # change of an amplitude that the effects of `undecided` may make, at least
 
 
-@dataclass(frozen=True)
-class OrderShare:
-    """Shares of the true amplitude of an order that the averages keep, over all its lines."""
-
-    order: float
-    name: str
-    observed: float
-    standard_error: float
-    before: float
-    after: float
-
-
-def order_shares(content: Mapping[str, Json]) -> tuple[OrderShare, ...]:
+def order_shares(content: Mapping[str, Json]) -> Sequence[Mapping[str, Json]]:
     """
-    Return measured and predicted shares by order, the mean over the channels.
+    Return the shares of the true amplitudes that averages keep: the mean of the lines of an order.
 
     All channels share the pulse errors, so that their mean is no more certain than one of them.
     """
     shares = []
     for order in sorted({item['order'] for item in content['lines']}):
         lines = [item for item in content['lines'] if item['order'] == order]
-        shares.append(OrderShare(order, lines[0]['name'], *(
-            float(np.mean([item[key] for item in lines])) for key in (
-                'observed', 'standard_error', 'predicted_before', 'predicted_after'))))
-    return tuple(shares)
+        shares.append({**lines[0], **{
+            key: float(np.mean([item[key] for item in lines])) for key in _MEANS}})
+    return shares
 
 
 def verdict_sentence(content: Mapping[str, Json]) -> str:
@@ -136,12 +123,14 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
     if content['clock_steps']:
         steps.append('Look for lost samples at the times of clock_steps: a buffer that overflows, '
                      'or a file that was cut. Each average that holds such a time is left out.')
-    if shares and min(item.observed for item in shares) < 1.0 - _LOSS:
-        worst = min(shares, key=lambda item: item.observed)
+    worst: Mapping[str, Json] = min(
+        shares, key=lambda item: float(item['observed']), default={'observed': 1.0})
+    if worst['observed'] < 1.0 - _LOSS:
         steps.append(
-            f'The averages lose {percent_text(1.0 - worst.observed, worst.standard_error)} of '
-            f'{order_words(worst.order, worst.name)}. Take corrected amplitudes (correct_jitter: '
-            'true in synchronous_averager), and compare no raw amplitudes across keyphasors.')
+            f'The averages lose {percent_text(1.0 - worst["observed"], worst["standard_error"])} '
+            f'of {order_words(worst["order"], worst["name"])}. Take corrected amplitudes '
+            '(correct_jitter: true in synchronous_averager), and compare no raw amplitudes across '
+            'keyphasors.')
     for item in content['missing_effects']:
         if item['name'] in EFFECTS and EFFECTS[item['name']].remedy:
             steps.append(f'Against {item["name"]}: {EFFECTS[item["name"]].remedy}.')

@@ -9,7 +9,7 @@
 # the License.
 
 """
-Evidence for lines in short-time spectra, and its sum over the teeth of a comb of orders.
+Evidence for lines in short-time spectra, its sum over a comb of orders, the path with the most.
 
 The power in a bin is compared with the noise around it. Peaks that belong to nobody are part of
 what is there without a line, so that one strong foreign line outweighs no comb.
@@ -20,8 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
+from scipy.ndimage import maximum_filter1d
 from scipy.special import gammaincc
 
+RULED_OUT = -20.0  # nats, more than a frame of any comb loses
+# A step of the path up to this share of the largest one costs so many nats.
+_COSTS = ((1.0 / 16.0, 0.0), (1.0 / 4.0, 0.5), (1.0, 2.0))
 _FOREIGN = 0.05  # of all bins hold a peak of something else
 _ABSENT = 0.3  # of the time a line of the machine is not to be seen
 _HOPS = 4  # of frames in the length of one
@@ -110,3 +114,40 @@ def comb(spectra: CombSpectra, speeds: FloatArray, orders: FloatArray) -> NDArra
         found[:, :place.size] += (1.0 - share) * spectra.evidence[:, below]
         found[:, :place.size] += share * spectra.evidence[:, below + 1]
     return found
+
+
+def best_path(evidence: NDArray[np.float32], largest: float) -> tuple[NDArray[np.intp], float]:
+    """
+    Return the cells (frame,) of the path with the most evidence (frame, cell), and its sum.
+
+    From a frame to the next it moves by at most `largest` cells.
+    """
+    steps = [(max(round(share * largest), 1), cost) for share, cost in _COSTS]
+    total = np.empty_like(evidence)
+    total[0] = evidence[0]
+    for k in range(1, len(evidence)):
+        before = total[k - 1]
+        total[k] = evidence[k] + np.maximum.reduce([
+            maximum_filter1d(before, 2 * reach + 1, mode='nearest') - cost
+            for reach, cost in steps])
+    path = np.empty(len(evidence), np.intp)
+    path[-1] = np.argmax(total[-1])
+    for k in range(len(evidence) - 1, 0, -1):
+        cell = path[k]
+        best = -np.inf
+        for reach, cost in steps:
+            first = max(cell - reach, 0)
+            part = total[k - 1, first:cell + reach + 1]
+            near = first + int(np.argmax(part - 1e-4 * np.abs(np.arange(first, first + part.size)
+                                                              - cell)))
+            if total[k - 1, near] - cost > best:
+                best, path[k - 1] = total[k - 1, near] - cost, near
+    return path, float(total[-1].max())
+
+
+def without(evidence: NDArray[np.float32], path: NDArray[np.intp], reach: NDArray[np.intp]
+            ) -> NDArray[np.float32]:
+    """Return the evidence with `reach` (frame,) cells on either side of a path ruled out."""
+    cells = np.arange(evidence.shape[1])
+    near = np.abs(cells - path[:, None]) <= reach[:, None]
+    return np.where(near, np.float32(RULED_OUT), evidence)

@@ -16,7 +16,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import Array, ComplexArray, FloatArray
-from sa_jitter_ros.tacholess.path import best_path
+from sa_jitter_ros.tacholess.evidence import best_path
 from scipy.ndimage import uniform_filter1d
 
 _PIECE = 1 << 19  # samples of a channel at a time, so that memory stays small

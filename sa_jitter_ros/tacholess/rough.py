@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.parameters import listed
-from sa_jitter_ros.tacholess.evidence import comb, CombSpectra, spectra_of
-from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
+from sa_jitter_ros.tacholess.evidence import (
+    best_path, comb, CombSpectra, RULED_OUT, spectra_of, without)
 
 _WINDOWS = (24.0, 12.0, 6.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
@@ -57,7 +57,6 @@ class Rough:
 class _Track:
     spectra: CombSpectra
     speeds: FloatArray
-    evidence: NDArray[np.float32]
     path: NDArray[np.intp]
     total: float
     other: float
@@ -113,7 +112,7 @@ def _track(spectra: CombSpectra, orders: FloatArray, speed_range: tuple[float, f
     near = np.ceil(_NEAR * spectra.step / (orders.min() * speeds[path]) / step).astype(np.intp)
     apart = without(evidence, path, near)
     other, other_total = best_path(apart, largest)
-    return _Track(spectra, speeds, evidence, path, total, other_total,
+    return _Track(spectra, speeds, path, total, other_total,
                   float(np.median(speeds[other])), float(np.mean(apart <= RULED_OUT)))
 
 
