@@ -37,7 +37,6 @@ _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how su
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 _NOISE_KNOWN = 0.5  # what the logarithm of the noise power is known to
 _MEMORIES = 3.0  # least number of memories in a stretch: longer ones look like a drift
-_CURVED = float(np.sqrt(ROUNDING))  # step of a parameter by which a curvature is measured
 
 
 class ShaftSpectrum:
@@ -228,24 +227,23 @@ class TimingFit:
         return sizes, covariance, self.ordinates - self.matrix @ sizes
 
     @cached_property
-    def _covariance(self) -> Array:
-        """Return the covariance of the parameters, by the curvature of the likelihood."""
-        count = self.parameters.size
-        curvature = np.zeros((count, count))
-        for i in range(count):
-            moved = np.stack([self.parameters, self.parameters])
-            moved[:, i] += np.array([_CURVED, -_CURVED])
-            curvature[i] = (self._cost(moved[0])[1] - self._cost(moved[1])[1]) / (2.0 * _CURVED)
-        free = self.lower < self.upper
-        # a parameter at its bound, or without influence, is known to its range at best
-        width = np.where(free, self.upper - self.lower, 1e-6)
-        curvature = 0.5 * (curvature + curvature.T) + np.diag(12.0 / width**2)
-        value, vector = np.linalg.eigh(curvature)
-        return np.asarray((vector / np.maximum(value, 12.0 / width.max() ** 2)) @ vector.T)
+    def _changes(self) -> Array:
+        """Return the whitened slopes (parameter, bin, 3, 3) of the cross-spectrum."""
+        return np.stack([self.inverse @ self.data.made(slope)
+                         for slope in self._densities(self.parameters)[1]])
+
+    @cached_property
+    def _information(self) -> Array:
+        """Return what data and prior are expected to tell of the parameters (Fisher)."""
+        return np.asarray(self._stiff.T @ self._stiff + np.einsum(
+            'f,afij,bfji->ab', self.data.size, self._changes, self._changes).real)
 
     def standard_errors(self, name: str) -> Array:
         """Return the standard errors of the parameters of a random component."""
-        return np.asarray(np.sqrt(np.diag(self._covariance)[self.place[name]]))
+        # a parameter at its bound, or without influence, is known to its range at best
+        width = np.where(self.lower < self.upper, self.upper - self.lower, 1e-6)
+        covariance = np.linalg.inv(self._information + np.diag(12.0 / width**2))
+        return np.asarray(np.sqrt(np.diag(covariance)[self.place[name]]))
 
     def more_than_held(self, name: str, kurtosis: float) -> tuple[float, float]:
         """
@@ -259,10 +257,8 @@ class TimingFit:
         at, size = self.parameters, self.data.size
         chosen = np.append(self.place[name].start,
                            np.flatnonzero((self.lower < at) & (at < self.upper)))
-        change = np.stack([self.inverse @ self.data.made(slope)
-                           for slope in self._densities(at)[1][chosen]])
-        prior = self._stiff[:, chosen]
-        known = prior.T @ prior + np.einsum('f,afij,bfji->ab', size, change, change).real
+        change = self._changes[chosen]
+        known = self._information[np.ix_(chosen, chosen)]
         known[1:, 1:] += np.diag(12.0 / (self.upper - self.lower)[chosen[1:]] ** 2)
         share = np.append(1.0, -np.linalg.solve(known[1:, 1:], known[1:, 0]))
         information = float(share @ known[0])
