@@ -13,6 +13,7 @@
 from dataclasses import replace
 import io
 import os
+import pickle
 import struct
 import sys
 import tracemalloc
@@ -1245,3 +1246,12 @@ def test_a_pipe_or_device_is_refused(tmp_path, name, make):
     opened = path if path.parent == tmp_path else path.parent
     with pytest.raises(RecordingError, match=f'{path.name} is a pipe or a device: give a file'):
         read(opened)
+
+
+def test_a_recording_can_be_sent_to_another_process(tmp_path, rng):
+    both = rng.standard_normal((500, 2)).astype(np.float32)
+    scipy.io.wavfile.write(tmp_path / 'rig.wav', 1000, both)
+    found = read(tmp_path / 'rig.wav', tach_channel='1')
+    sent = pickle.loads(pickle.dumps(found))
+    np.testing.assert_array_equal(sent.read(), both[:, :1].T)
+    np.testing.assert_array_equal(sent.read_tach(), both[:, 1])

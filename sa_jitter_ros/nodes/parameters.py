@@ -167,9 +167,9 @@ class ParameterSet:
 
     def declare(self, specifications: Sequence[Parameter]) -> None:
         """Declare parameters; raises `ParameterError` for a value of wrong type or range."""
+        given = self.given_values
         for item in specifications:
-            value = item.convert(self._node._parameter_overrides[item.name].value
-                                 if item.name in self.given_values
+            value = item.convert(given[item.name] if item.name in given
                                  else self._following.get(item.name, item.default))
             self._node.declare_parameter(
                 item.name, value, descriptor_of(item), ignore_override=True)

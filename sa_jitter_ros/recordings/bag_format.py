@@ -18,7 +18,7 @@ topic is (`/rig/vibration` is `vibration`); a channel map can name others.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 import math
 from pathlib import Path
 from typing import Any
@@ -177,24 +177,27 @@ def _type_of(reader: Any, topic: str) -> str:
     return str(reader.topics[topic].msgtype).replace('/msg/', '/')
 
 
+def _parts_of(path: Path, topic: str, sample_rate: float | None, samples_per_block: int
+              ) -> Iterator[FloatArray]:
+    with recording_errors(path), _reader(path) as reader:
+        messages = _blocks(reader, topic, sample_rate)
+        yield from rechunk(_BlockRun(topic).continuous(messages), samples_per_block)
+
+
 def _samples(reader: Any, path: Path, topic: str, sample_rate: float | None) -> Recording:
     """
     Read a topic once and return its samples as a recording.
 
     Lost ones are NaN, repeated ones are skipped.
     """
-    def blocks(samples_per_block: int) -> Iterator[FloatArray]:
-        with recording_errors(path), _reader(path) as again:
-            messages = _blocks(again, topic, sample_rate)
-            yield from rechunk(_BlockRun(topic).continuous(messages), samples_per_block)
-
     run = _BlockRun(topic)
     for _ in run.continuous(_blocks(reader, topic, sample_rate)):
         pass
     if run.first is None:
         raise RecordingError(f'{topic} has no messages: record the topic')
     imu = _type_of(reader, topic) == IMU
-    source = SampleSource(len(run.first.samples), run.received, blocks)
+    source = SampleSource(len(run.first.samples), run.received,
+                          partial(_parts_of, path, topic, sample_rate))
     return Recording(source, run.first.sample_rate, tuple(_IMU_AXES) if imu else (),
                      ('m/s^2',) if imu else (), run.first.start_time, remarks=run.remarks())
 

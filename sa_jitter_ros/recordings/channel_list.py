@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,19 +60,21 @@ ChannelList = tuple[Sequence[Channel], Sequence[str], Opened]
 
 def source_of(path: Path, parts: Sequence[Channel], opened: Opened) -> SampleSource:
     """Return the samples of channels that were sampled together; `opened` opens their file."""
+    return SampleSource(len(parts), parts[0].samples, partial(_parts_of, path, parts, opened))
+
+
+def _parts_of(path: Path, parts: Sequence[Channel], opened: Opened, samples_per_block: int
+              ) -> Iterator[FloatArray]:
+    """Iterate over `channel` x `sample` blocks, with the file open all the time."""
     samples = parts[0].samples
-
-    def blocks(samples_per_block: int) -> Iterator[FloatArray]:  # the file is open all the time
-        with recording_errors(path), opened() as file:
-            for start in range(0, samples, samples_per_block):
-                stop = min(start + samples_per_block, samples)
-                rows = [np.asarray(part.read(file, start, stop), np.float64) for part in parts]
-                if any(row.shape != (stop - start,) for row in rows):
-                    raise RecordingError(f'samples {start} to {stop} cannot be read: the file is '
-                                         'truncated or broken; copy it again')
-                yield np.stack(rows)
-
-    return SampleSource(len(parts), samples, blocks)
+    with recording_errors(path), opened() as file:
+        for start in range(0, samples, samples_per_block):
+            stop = min(start + samples_per_block, samples)
+            rows = [np.asarray(part.read(file, start, stop), np.float64) for part in parts]
+            if any(row.shape != (stop - start,) for row in rows):
+                raise RecordingError(f'samples {start} to {stop} cannot be read: the file is '
+                                     'truncated or broken; copy it again')
+            yield np.stack(rows)
 
 
 def recording_of(path: Path, listed: ChannelList, *, channel_map: ChannelMap,

@@ -39,7 +39,8 @@ class SampleSource:
     Samples of one or more `channels` that can be read again and again, block by block.
 
     `blocks` iterates over them, `channel` x `sample`: all blocks but the last have the number of
-    samples that it is called with. `samples` is the number of all of a channel.
+    samples that it is called with. `samples` is the number of all of a channel. To be sent to
+    another process, `blocks` is a function of a module, or part of one.
     """
 
     channels: int
@@ -63,7 +64,12 @@ def _parts_of(array: Array, samples_per_block: int) -> Iterator[FloatArray]:
 def changed(source: SampleSource, channels: int, change: Callable[[FloatArray], FloatArray]
             ) -> SampleSource:
     """Return another source, each of whose blocks is changed: into one of so many `channels`."""
-    return SampleSource(channels, source.samples, lambda count: map(change, source.blocks(count)))
+    return SampleSource(channels, source.samples, partial(_changed_parts, source, change))
+
+
+def _changed_parts(source: SampleSource, change: Callable[[FloatArray], FloatArray],
+                   samples_per_block: int) -> Iterator[FloatArray]:
+    return map(change, source.blocks(samples_per_block))
 
 
 def mapped(pieces: Iterable[bytes], dtype: DTypeLike) -> NDArray[Any]:
