@@ -25,7 +25,7 @@ from sa_jitter_ros.keyphasor_check.jitter import Jitter, measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     _per_line, find_lines, marks_evidence, on_orders, ToothLines)
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
-from sa_jitter_ros.keyphasor_check.marks import fit_pulses
+from sa_jitter_ros.keyphasor_check.marks import fit_pulses, number_and_patterns
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
 from sa_jitter_ros.keyphasor_check.vibration import recovered_jitter
 from sa_jitter_ros.keyphasor_check.wheel import _missing, patterns
@@ -129,6 +129,15 @@ def test_marks_have_their_places_and_errors(rng):
     assert 0.7 < size < 1.4  # 120 values, of which those of a target sum to 0
 
 
+def test_even_marks_of_which_many_are_lost_have_no_pattern(rng):
+    """A stray that stands far from all marks speaks for no gap in which it stands."""
+    for _ in range(6):
+        turns = np.flatnonzero(rng.random(4000) > 0.2) / 4.0 + rng.normal(0.0, 1e-4, 1)
+        turns += rng.normal(0.0, 1e-4, turns.size)
+        strays = rng.uniform(0.0, turns[-1], int(rng.integers(20, 200)))
+        assert not patterns(number_pulses(np.sort(np.append(turns, strays)) / SPEED))
+
+
 @pytest.mark.machines
 def test_even_marks_have_no_pattern(rng):
     """Of 40 even targets at most one looks uneven."""
@@ -193,7 +202,39 @@ def test_standstill_costs_nothing_else(rng):
     assert check.findings['speed'].value['mean'] == pytest.approx(SPEED, rel=0.01)
 
 
+@pytest.mark.parametrize('behind', [5, 400])
+def test_uneven_marks_are_found_again_behind_a_standstill(rng, behind):
+    """The marks in front of it show which one comes first behind it, however few follow."""
+    late = rng.permutation(np.linspace(-0.05, 0.05, 12))  # rad
+    numbers = np.append(np.arange(480), 485 + np.arange(behind))
+    times = (numbers / 12 + late[numbers % 12] / (2.0 * np.pi)) / SPEED + 5.0 * (numbers >= 480)
+    fitted = fit_pulses(number_pulses(times), 12)
+    assert (fitted.strays.size, fitted.lost.size, fitted.breaks.tolist()) == (0, 0, [480])
+    assert np.all(np.diff(fitted.pattern.tooth(fitted.numbers) - numbers) % 12 == 0)
+    pitch = np.diff(fitted.true)[np.diff(numbers) == 1] * SPEED * 12
+    assert np.abs(pitch - 1.0).max() < 5e-3
+
+
+def test_a_pulse_that_is_there_twice_is_a_stray_once(rng):
+    times = tach(rng, 12, missing=(11,))[0]
+    twice = np.sort(rng.choice(times, 30, replace=False))
+    both = np.sort(np.append(times, twice))
+    numbered, found = number_and_patterns(both)
+    assert (found[0].teeth, found[0].present) == (12, 11)
+    assert np.array_equal(numbered.times, times)
+    assert np.array_equal(numbered.strays, twice)
+
+
 # --- clock and jitter ---------------------------------------------------------------------------
+
+@pytest.mark.parametrize('drift', [1e-4, 1e-3])
+def test_a_pulse_that_is_a_tick_late_is_no_stray(drift):
+    """A steady speed is a whole number of ticks for most pulses, which seem to have no errors."""
+    number, tick = np.arange(4000), 1.0 / (SPEED * 12 * 20)
+    times = np.ceil(number / (SPEED * 12) * (1.0 + drift * number / 4000) / tick) * tick
+    fitted = fit_pulses(number_pulses(times), 1, tick=tick)
+    assert fitted.strays.size == fitted.lost.size == 0
+
 
 @pytest.mark.parametrize('clock', [5000.0, 51_200.0, 3.125e6])
 @pytest.mark.parametrize('drift', [0.0, 0.5])

@@ -55,7 +55,7 @@ def costs(findings: Mapping[str, Checked], fitted: FittedPulses, times: FloatArr
     ratio = float(findings['ratio'].value or 1.0)
     return [*_of_pulses(fitted, orders), *_of_marks(fitted, ratio, orders),
             *_of_jitter(findings, ratio, orders),
-            *_of_speed(fitted, ratio, orders, from_marks), *_of_changes(times)]
+            *_of_speed(fitted, ratio, orders, from_marks), *_of_changes(np.unique(times))]
 
 
 def _of_pulses(fitted: FittedPulses, orders: Sequence[float]) -> list[Warn]:

@@ -138,8 +138,14 @@ def number_and_patterns(times: FloatArray) -> tuple[NumberedPulses, list[Marking
     Return pulses (n,) in s numbered on their target, and its patterns, the best first.
 
     Where strays and gaps are frequent, the numbers of teeth may be wrong, and all pulses those of
-    marks that stand unevenly.
+    marks that stand unevenly. Pulses of equal times are one, and strays.
     """
+    apart = np.append(True, np.diff(times) > 0.0)
+    numbered, found = _number_and_patterns(times[apart])
+    return replace(numbered, strays=np.sort(np.append(numbered.strays, times[~apart]))), found
+
+
+def _number_and_patterns(times: FloatArray) -> tuple[NumberedPulses, list[Marking]]:
     numbered = number_pulses(times)
     found = patterns(numbered)
     if found and found[0].present == 1:  # one mark, and the teeth between are none

@@ -97,7 +97,7 @@ def joined_parts(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
 
 def number_pulses(times: FloatArray) -> NumberedPulses:
     """
-    Return pulses (n,) in s, in order of time, numbered by tooth.
+    Return pulses (n,) in s, whose times rise, numbered by tooth.
 
     Of several widths of neighbourhood the one is taken with which the pulses stand nearest to
     their teeth. Six teeth of which one lacks its pulse, and a stray:
@@ -106,10 +106,6 @@ def number_pulses(times: FloatArray) -> NumberedPulses:
     >>> found.numbers.tolist(), found.strays.tolist()
     ([0, 1, 2, 3, 5, 6, 7, 8], [2.4])
     """
-    apart = np.append(True, np.diff(times) > 0.0)
-    if not apart.all():
-        found = number_pulses(times[apart])
-        return replace(found, strays=np.sort(np.append(found.strays, times[~apart])))
     best = _best(times, 1.0)
     if _unfit(best) > _ROUGH:  # most intervals may be gaps
         for scale in _FINER:

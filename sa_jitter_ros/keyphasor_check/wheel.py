@@ -164,7 +164,11 @@ class _Evidence:
         self._even = _scatter(places - np.median(places))
 
     def of(self, teeth: int) -> float:
-        """Return the log likelihood of a target of so many teeth, less half a log n a value."""
+        """
+        Return the log likelihood of a target of so many teeth, less half a log n a value.
+
+        It is over that of even teeth where the target has pulses.
+        """
         classes = self._numbers % teeth
         seen, span = _seen_of(self._numbers, teeth)
         missing = _missing(seen, span)
@@ -184,10 +188,11 @@ class _Evidence:
         mean = np.bincount(classes, place, teeth) / np.maximum(seen, 1)
         # Least absolute deviations: strays that pass for pulses say little.
         uneven = _scatter(place - mean[classes])
-        # Gaps need not have uneven teeth between them.
+        # Gaps need not have uneven teeth between them. Pulses in them are in neither scatter: a
+        # stray far from its place would speak for any gap.
         penalty = 0.5 * math.log(count)
         return _TEMPER * occupancy - 2.0 * penalty * gaps + max(
-            -_TEMPER * count * even, -_TEMPER * count * uneven - penalty * (teeth - gaps - 1))
+            0.0, _TEMPER * count * (even - uneven) - penalty * (teeth - gaps - 1))
 
 
 def _scatter(away: FloatArray) -> float:
