@@ -10,11 +10,9 @@
 
 """The quality gates: style as ROS packages have it, ruff, and strict types."""
 
-from configparser import ConfigParser
-from hashlib import sha256
 from importlib import import_module
-from importlib.resources import files
 from importlib.util import find_spec
+import os
 from pathlib import Path
 import subprocess
 import sys
@@ -48,6 +46,13 @@ def check(tool, *arguments):
         pytest.fail(f'{tool}:\n{result.stdout}{result.stderr}', pytrace=False)
 
 
+def python_files():
+    """Return the paths of all files in Python."""
+    return [ROOT / 'setup.py', *(path for folder in (*SOURCES, 'launch')
+                                 for path in sorted((ROOT / folder).glob('**/*.py'))
+                                 if '.venv' not in path.parts)]
+
+
 def test_ruff():
     check('ruff', 'check', '--output-format=concise', '--quiet', '.')
 
@@ -56,47 +61,24 @@ def test_codespell():
     check('codespell_lib', *SOURCES, 'README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst', 'config')
 
 
+def test_imports_are_in_the_order_of_ament():
+    """Ruff has an order of its own: the plugin of ament_flake8 is asked, without flake8."""
+    orders = pytest.importorskip('flake8_import_order.checker')
+    style = import_module('flake8_import_order.styles').lookup_entry_point('google')
+    orders.ImportOrderChecker.options = {'import_order_style': style}
+    wrong = [f'{path.relative_to(ROOT)}:{error.lineno}: {error.code} {error.message}'
+             for path in python_files()
+             for error in orders.ImportOrderChecker(str(path), None).check_order()
+             if error.code != 'I202']
+    assert wrong == []
+
+
 @pytest.mark.style
-def test_flake8(cache):
-    """Files that it found right before, by the same rules, are not checked again, as in mypy."""
-    if find_spec('flake8') is None:
-        pytest.skip('flake8 is not installed')
-    version = subprocess.run([sys.executable, '-m', 'flake8', '--version'], capture_output=True,
-                             check=True).stdout
-    rules = version + (ROOT / 'setup.cfg').read_bytes()
-    paths = [ROOT / 'setup.py', *(path for folder in (*SOURCES, 'launch')
-                                  for path in sorted((ROOT / folder).glob('**/*.py')))]
-    found = {str(path.relative_to(ROOT)): sha256(rules + path.read_bytes()).hexdigest()
-             for path in paths if '.venv' not in path.parts}
-    known = cache.get('flake8', {})
-    changed = [name for name, digest in found.items() if known.get(name) != digest]
-    if changed:
-        check('flake8', *changed)
-    cache.set('flake8', found)
-
-
-def test_flake8_has_the_settings_of_ament():
-    if find_spec('ament_flake8') is None:
-        pytest.skip('ament_flake8 is not installed')
-    ours, theirs = ConfigParser(), ConfigParser()
-    ours.read(ROOT / 'setup.cfg')
-    theirs.read_string(
-        files('ament_flake8').joinpath('configuration/ament_flake8.ini').read_text())
-    style = {key: value for key, value in theirs['flake8'].items()
-             if key not in ('show-source', 'statistics')}
-    assert style.items() <= dict(ours['flake8']).items()
-
-
-def test_docstrings_are_checked_as_ament_pep257_does():
-    """flake8-docstrings asks what ament_pep257 does: pydocstyle, without the same codes."""
-    if find_spec('ament_pep257') is None:
-        pytest.skip('ament_pep257 is not installed')
-    theirs = import_module('ament_pep257.main')._ament_ignore
-    ours = ConfigParser()
-    ours.read(ROOT / 'setup.cfg')
-    ignored = ours['flake8']['extend-ignore'].split(',')
-    assert {code for code in ignored if code.startswith('D')} <= set(theirs)
-    assert ours['flake8']['docstring-convention'] == 'all'
+@pytest.mark.skipif('ROS_DISTRO' not in os.environ, reason='ruff asks what ament_flake8 and '
+                    'ament_pep257 do: those of ROS 2 run where it is sourced')
+@pytest.mark.parametrize('linter', ['ament_flake8', 'ament_pep257'])
+def test_linters_of_ros(linter):
+    check(f'{linter}.main', *map(str, python_files()))
 
 
 def test_every_file_states_copyright_and_licence():

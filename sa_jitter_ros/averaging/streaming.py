@@ -368,7 +368,7 @@ class StreamingAverager:
         """
         clock, samples = segment.clock, segment.samples
         offset = clock.index - segment.index
-        times = times[:min([item.room for item in self.shafts.values()]) + 1] - clock.time
+        times = times[:min(item.room for item in self.shafts.values()) + 1] - clock.time
 
         def cycles_to(position: float) -> int:
             return int(times.searchsorted((position - offset) / clock.rate, 'right')) - 1
@@ -381,14 +381,14 @@ class StreamingAverager:
         if count > 1:
             if not segment.closed:
                 count = cycles_to(min(reach, last - margin))
-            shortest = max([item.shortest(clock.rate) for item in self.shafts.values()])
+            shortest = max(item.shortest(clock.rate) for item in self.shafts.values())
             if min(periods) <= shortest:  # a cycle that a shaft refuses is taken alone
                 count = min(count, next(k for k, item in enumerate(periods) if item <= shortest))
         return max(count, 1), margin
 
     def _margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s needs on either side, for any shaft."""
-        return max([item.margin(period, rate) for item in self.shafts.values()])
+        return max(item.margin(period, rate) for item in self.shafts.values())
 
     def _uncovered(self, stop: int) -> int:
         """Return the number of cycles, from the next one on, whose vibration will not come."""

@@ -30,8 +30,8 @@ from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
     DirectEffect, largest_power, ONE_SIDED, parameter_ranges, possible, RARE, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.effects.lattice import coarsest_clock
 from sa_jitter_ros.effects.jitter_scale import JitterScale
+from sa_jitter_ros.effects.lattice import coarsest_clock
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, Pattern, Spectrum
 from sa_jitter_ros.errors import ParameterError

@@ -13,20 +13,15 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-
 def weighted_sums(samples: FloatArray, origin: NDArray[np.int32], begin: FloatArray,
                   length: FloatArray, u: FloatArray, polynomials: FloatArray, values: FloatArray, /
                   ) -> None: ...
 
-
 def frames(samples: FloatArray, values: FloatArray, /) -> bool: ...
-
 
 def add_steps(values: FloatArray, first: FloatArray, total: FloatArray, squares: FloatArray, /
               ) -> None: ...
 
-
 def add_products(table: FloatArray, values: FloatArray, sums: FloatArray, /) -> None: ...
-
 
 def take_lanes(most: int, /) -> int: ...
