@@ -242,7 +242,8 @@ def test_motor_run_up_from_rest(shared_data):
     assert 1.0 / (8.0 * np.diff(late[:9]).mean()) == pytest.approx(39.0, rel=0.02)
     assert 1.0 / (8.0 * np.diff(late[-9:]).mean()) == pytest.approx(48.0, rel=0.02)
     assert np.diff(late).max() < 1.1 * np.diff(late).min() * 48.0 / 39.0
-    assert pulses[0] > 0.2  # nothing from the least significant bits at rest
+    assert 0.2 < pulses[0] < 0.4  # nothing from the least significant bits at rest
+    assert np.diff(pulses, 2).max() < 1e-4  # faster from pulse to pulse, none is lost
 
 
 @pytest.mark.parametrize('name', ['weight', 'weight_5', 'without_weight'])
@@ -307,6 +308,35 @@ def test_waveforms_of_sensors(kind, sign, rng):
         assert pulses.size in (199, 200)
         assert np.diff(pulses) == pytest.approx(0.05, abs=2e-3)
         assert detector.state.polarity == ('positive' if sign > 0.0 else 'negative')
+
+
+@pytest.mark.parametrize('shape', ['half sine', 'bell', 'two lobes'])
+def test_slow_edges_in_noise_are_one_pulse_each(shape, rng):
+    """Noise of 3 % crosses such an edge often."""
+    for _ in range(12):
+        rate, speed = rng.choice([5e3, 51.2e3]), rng.uniform(8.0, 50.0)
+        width = rng.uniform(0.08, 0.3)
+        turn = speed * np.arange(round(4.0 * rate)) / rate - 0.3
+        x = ((turn + 0.5) % 1.0 - 0.5) / width
+        wave = {'half sine': np.where(np.abs(x) < 0.5, np.cos(np.pi * x), 0.0),
+                'bell': np.exp(-0.5 * (x / 0.2) ** 2),
+                'two lobes': -x / 0.2 * np.exp(0.5 - 0.5 * (x / 0.2) ** 2)}[shape]
+        if shape != 'two lobes':  # the resting level moves
+            wave += 0.15 * np.sin(2.0 * np.pi * (turn + rng.uniform()))
+        wave += 0.03 * rng.standard_normal(turn.size)
+        pulses, _ = detect(wave * rng.uniform(0.1, 10.0) + rng.uniform(-9.0, 9.0), rate=rate)
+        assert np.diff(pulses) * speed == pytest.approx(1.0, abs=0.15 * width)
+        assert abs(pulses.size - 4.0 * speed) < 1.0
+
+
+def test_narrow_pulses_without_a_flat_top_stand_out_of_a_moving_level(rng):
+    for width in rng.uniform(0.04, 0.1, 8):
+        turn = 27.0 * np.arange(200_000) / 51.2e3 - 0.3
+        wave = np.maximum(1.0 - 2.0 * np.abs((turn + 0.5) % 1.0 - 0.5) / width, 0.0)
+        wave += 0.15 * np.sin(2.0 * np.pi * (turn + rng.uniform()))
+        pulses, _ = detect(wave, rate=51.2e3)
+        assert np.diff(pulses) * 27.0 == pytest.approx(1.0, abs=0.02)
+        assert abs(pulses.size - 27.0 * 200_000 / 51.2e3) < 1.0
 
 
 @pytest.mark.parametrize('mains', [50.0, 60.0])

@@ -43,6 +43,9 @@ Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first
 _STOPPED = 0.1
 # Fraction of the level difference by which the levels of the same signal may have drifted.
 _DRIFTED = 0.5
+# Half of the hysteresis: at least so many standard deviations of the noise, by which a slow edge
+# crosses the threshold several times, but at most this fraction of the level difference.
+_BEYOND_NOISE, _WIDEST = 4.0, 0.2
 # Part of a lobe that a signal must pass on either side of the resting level.
 _PASSED = 0.4
 # Share of the samples above the middle from which on pulses are taken for negative.
@@ -88,7 +91,8 @@ class KeyphasorDetector:
     the steep crossing between the lobes.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
-    :param hysteresis: width of the band around the threshold, a fraction of the level difference.
+    :param hysteresis: width of the band around the threshold, a fraction of the level difference;
+        unless 0 it is widened to 8 standard deviations of the noise, up to half the difference.
     :param polarity: 'negative' for pulses below the resting level; their first edge is 'rising'.
         'auto': decided from the first levels; the state in which the signal is less often is the
         pulse, the upper one where they are about equal.
@@ -277,12 +281,11 @@ class KeyphasorDetector:
             self._trigger_origin, self._leading, self._last_pulse = origin, None, -np.inf
             self._bridge = np.nan
         levels = self._levels or StateLevels(0.0, 0.0, significant=False)
-        band = 0.5 * self._hysteresis * levels.difference
         if self._levels:
             samples = self._bridged(samples, levels)
         steep = levels.steep if self._given_threshold is None else ''
         crossings, rising = self._trigger.update(
-            samples, index, self._threshold(levels), _PASSED * levels.lobe if steep else band)
+            samples, index, self._threshold(levels), self._band(levels, steep=bool(steep)))
         if steep:
             crossings = crossings[rising == (steep == 'rising')]
         elif self._edge == 'centre':
@@ -292,6 +295,14 @@ class KeyphasorDetector:
         pulses = self._apart(origin + crossings / self._rate)
         self._pulses += pulses.size
         return pulses
+
+    def _band(self, levels: StateLevels, *, steep: bool) -> float:
+        """Return half of the hysteresis: 0 if it is, but between lobes."""
+        if not (self._hysteresis or steep):
+            return 0.0
+        least, most = (_PASSED * levels.lobe, 2.0 * _PASSED * levels.lobe) if steep else (
+            0.5 * self._hysteresis * levels.difference, _WIDEST * levels.difference)
+        return max(least, min(_BEYOND_NOISE * levels.noise, most))
 
     def _centres(self, crossings: FloatArray, rising: npt.NDArray[np.bool_]) -> FloatArray:
         """Return the middles of rising crossings and the falling ones that follow them."""

@@ -16,8 +16,8 @@ DETECTOR_PARAMETERS = (
     Parameter('automatic_threshold', True, 'learn the threshold from the low and high level of '
               'the waveform'),
     Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
-    Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of high '
-              'minus low level', minimum=0.0, maximum=0.99),
+    Parameter('hysteresis', 0.1, 'band around the threshold, as a fraction of high minus low '
+              'level; wider in noise, unless 0', minimum=0.0, maximum=0.99),
     Parameter('polarity', 'positive', 'positive: pulses are above the threshold; negative: below; '
               'auto: pulses have the rarer level',
               choices=('positive', 'negative', 'auto')),

@@ -54,6 +54,7 @@ _CENTRAL = 0.25  # part of them, by which the middle of the modes may be beside 
 _LOBES, _RESTS, _NEAR, _LOBE, _JOINED = 0.25, 0.4, 0.15, 0.5, 2.0
 # A waveform that is so often near one of its levels is no hum: a sine is in 41 % of its samples.
 _AT_LEVELS, _CLOSE = 0.6, 0.1
+_SECOND = 0.6745 * math.sqrt(6.0)  # median of second differences of white noise of size 1
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -65,7 +66,8 @@ class StateLevels:
     `significant` is True where samples change between two levels, False for a constant or white
     noise. Pulses with lobes on both sides of a `resting` level (else NaN) cross it between the
     lobes, the `steep` way: 'rising' or 'falling', '' for pulses with one lobe. `share` is that of
-    the samples above the middle, `pulsed` tells that most samples are near one of the levels.
+    the samples above the middle, `pulsed` tells that most samples are near one of the levels,
+    `noise` is the standard deviation of white noise whose second differences are as large.
     All samples that are no spikes are from `lowest` to `highest`.
     """
 
@@ -76,6 +78,7 @@ class StateLevels:
     steep: str = ''
     share: float = math.nan
     pulsed: bool = False
+    noise: float = 0.0
     lowest: float = math.nan
     highest: float = math.nan
 
@@ -155,6 +158,7 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
         kept > levels.high - near)
     return replace(levels, share=float(np.mean(kept > levels.middle)),
                    pulsed=bool(levels.steep) or bool(at_levels > _AT_LEVELS * kept.size),
+                   noise=float(np.median(np.abs(np.diff(kept, 2)))) / _SECOND,
                    lowest=float(kept.min()), highest=float(kept.max()))
 
 
@@ -193,6 +197,13 @@ def _runs(inside: BoolArray) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]
     """Return begin and end (run,) of runs of samples that are `inside`."""
     change = np.flatnonzero(np.diff(inside.view(np.int8), prepend=0, append=0))
     return change[::2], change[1::2]
+
+
+def _held(samples: FloatArray, level: float) -> BoolArray:
+    """Return where samples (n,) are above the level, or since then above half of it."""
+    above = samples > level
+    decided = np.where(above | (samples < 0.5 * level), np.arange(samples.size), 0)
+    return np.asarray(above[np.maximum.accumulate(decided)])
 
 
 def _regular(begin: npt.NDArray[np.intp]) -> bool:
@@ -245,10 +256,10 @@ def _passed_by_all(samples: FloatArray) -> StateLevels | None:
                         - np.bincount(place[rises + 1], minlength=_BINS + 1))
     below = np.cumsum(np.bincount(place, minlength=_BINS + 1))
     ends = np.flatnonzero(np.diff(crossed, prepend=-1, append=-1))
-    begin, end = ends[:-1], ends[1:] - 1
-    beyond = np.minimum(below[begin], samples.size - below[end])
-    held = np.flatnonzero(
-        (crossed[begin] > 1) & (end - begin >= _GAP) & (beyond > _HELD * samples.size))
+    # Pulses without a flat top are crossed equally often up to their tips.
+    most = np.searchsorted(below, np.array([_HELD, 1.0 - _HELD]) * samples.size)
+    begin, end = np.maximum(ends[:-1], most[0]), np.minimum(ends[1:], most[1]) - 1
+    held = np.flatnonzero((crossed[begin] > 1) & (end - begin >= _GAP))
     if not held.size:
         return None
     widest = max(held, key=lambda k: ((end[k] - begin[k]) // _GAP, -crossed[begin[k]]))
@@ -273,8 +284,8 @@ def _lobes(samples: FloatArray) -> StateLevels | None:
     if min(up, down) < _LOBES * max(up, down) or np.mean(
             np.abs(samples - resting) < _NEAR * min(up, down)) < _RESTS:
         return None
-    first, first_end = _runs(samples > resting + _LOBE * up)
-    second, second_end = _runs(samples < resting - _LOBE * down)
+    first, first_end = _runs(_held(samples - resting, _LOBE * up))
+    second, second_end = _runs(_held(resting - samples, _LOBE * down))
     if first.size < 2 or abs(first.size - second.size) > 1:
         return None
     width = float(np.median(np.concatenate((first_end - first, second_end - second))))
