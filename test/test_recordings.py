@@ -757,6 +757,21 @@ def test_csv_whose_commas_are_decimal_points_too_is_refused(tmp_path):
         read(tmp_path / 'log.csv', sample_rate=1e3)
 
 
+def test_csv_cells_without_a_number_are_gaps(rng, tmp_path):
+    """Tables have empty cells for what is missing, and scopes an infinity beyond their range."""
+    a, b = rng.standard_normal((2, 500)).round(6)
+    rows = [[f'{k / RATE:.9g}', str(a[k]), str(b[k])] for k in range(500)]
+    rows[100][1], rows[101][2] = '', ' '
+    rows[200][1], rows[300][1] = '\N{INFINITY}', '-\N{INFINITY}'
+    (tmp_path / 'rig.csv').write_text('time,a,b\n' + '\n'.join(map(','.join, rows)), 'utf-8')
+    a[[100, 200, 300]] = b[101] = np.nan
+    np.testing.assert_array_equal(read(tmp_path / 'rig.csv').read(), [a, b])
+    rows[400][0] = ''
+    (tmp_path / 'rig.csv').write_text('time,a,b\n' + '\n'.join(map(','.join, rows)), 'utf-8')
+    with pytest.raises(RecordingError, match=r'rows 0 to 500: .*give numbers only'):
+        read(tmp_path / 'rig.csv').read()
+
+
 @pytest.mark.parametrize('place', [0, 1, 2, 3, 20])
 def test_csv_with_a_bad_row_is_not_shortened(tmp_path, place):
     rows = [','.join(row) for row in ROWS]

@@ -15,7 +15,7 @@ What a file holds is told by its structure (`csv_layout`): lines above the sampl
 Its numbers are read once, block by block, into an unnamed temporary file that is mapped.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -36,7 +36,7 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
 
     Lines below the table, and a last row that is cut off, are left out. The sampling rate is
     `sample_rate`, with which the times must agree within half a sample, else the mean rate of the
-    times. Raises RecordingError if there is neither, or a row is not numeric.
+    times. Empty cells are NaN. Raises RecordingError if there is neither, or a row is not numeric.
     """
     layout = layout_of(path)
     names = layout.names
@@ -133,12 +133,19 @@ def _cut_end(rows: list[str], layout: CsvLayout, columns: tuple[int, ...], start
 def _parse(rows: Sequence[str], layout: CsvLayout, columns: tuple[int, ...], start: int
            ) -> FloatArray:
     """Return rows, of which `start` is the first, as `row` x `column`."""
-    try:
-        return np.loadtxt(
-            rows, delimiter=layout.delimiter.strip(' ') or None, usecols=columns, ndmin=2,
-            comments=None, dtype=np.float64, quotechar='"', encoding=None,
-            converters=None if layout.time is None else {layout.time: number_of})
-    except ValueError as error:
-        reason = str(error).split(';')[0]
-        raise RecordingError(f'rows {start} to {start + len(rows)}: {reason}; give numbers '
-                             'only') from error
+    time: dict[int | str, Callable[[str], float]] = (
+        {} if layout.time is None else {layout.time: number_of})
+    for converters in (time, dict.fromkeys(columns, _sample_of) | time):
+        try:
+            return np.loadtxt(
+                rows, delimiter=layout.delimiter.strip(' ') or None, usecols=columns, ndmin=2,
+                comments=None, dtype=np.float64, quotechar='"', encoding=None,
+                converters=converters)
+        except ValueError as error:  # the fast way knows no empty cells
+            reason = str(error).split(';')[0]
+    raise RecordingError(f'rows {start} to {start + len(rows)}: {reason}; give numbers only')
+
+
+def _sample_of(text: str) -> float:
+    """Return the number that a cell is, NaN for none and for a sample beyond the range."""
+    return float(text) if text.strip().strip('+-') not in ('', '\N{INFINITY}') else np.nan
