@@ -329,6 +329,27 @@ def test_slow_edges_in_noise_are_one_pulse_each(shape, rng):
         assert abs(pulses.size - 4.0 * speed) < 1.0
 
 
+@pytest.mark.parametrize('rate', [12.8e3, 51.2e3])
+def test_noise_of_slow_edges_is_averaged_over_their_samples(rate, rng):
+    """
+    The time of a line through n samples has the standard deviation noise / (slope sqrt(n)).
+
+    Its samples are at most those nearer than 4 standard deviations of the noise: an edge ends with
+    the first one beyond, which noise brings there earlier. Two samples alone have three times it.
+    """
+    noise, speed, width = 0.02, 25.0, 0.2
+    turn = speed * np.arange(round(16.0 * rate)) / rate - 0.3
+    x = ((turn + 0.5) % 1.0 - 0.5) / width
+    wave = np.where(np.abs(x) < 0.5, np.cos(np.pi * x), 0.0)
+    pulses, _ = detect(wave + noise * rng.standard_normal(wave.size), rate=rate)
+    slope = np.pi * np.sqrt(0.75) / width * speed / rate  # of a sample, half way up
+    expected = noise / slope / np.sqrt(8.0 * noise / slope) / rate
+    late = pulses - (np.arange(400) + 0.3) / speed
+    late -= np.median(late)
+    assert 1.4826 * np.median(np.abs(late)) < 1.4 * expected
+    assert np.std(late) < 2.0 * expected  # a few edges end early
+
+
 def test_narrow_pulses_without_a_flat_top_stand_out_of_a_moving_level(rng):
     for width in rng.uniform(0.04, 0.1, 8):
         turn = 27.0 * np.arange(200_000) / 51.2e3 - 0.3

@@ -285,7 +285,8 @@ class KeyphasorDetector:
             samples = self._bridged(samples, levels)
         steep = levels.steep if self._given_threshold is None else ''
         crossings, rising = self._trigger.update(
-            samples, index, self._threshold(levels), self._band(levels, steep=bool(steep)))
+            samples, index, self._threshold(levels), self._band(levels, steep=bool(steep)),
+            _BEYOND_NOISE * levels.noise)
         if steep:
             crossings = crossings[rising == (steep == 'rising')]
         elif self._edge == 'centre':

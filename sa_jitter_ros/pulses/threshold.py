@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from sa_jitter_ros.arrays import BoolArray, FloatArray
+from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 
 __all__ = ['SchmittTrigger', 'StateLevels', 'state_levels']
 
@@ -54,6 +54,8 @@ _CENTRAL = 0.25  # part of them, by which the middle of the modes may be beside 
 _LOBES, _RESTS, _NEAR, _LOBE, _JOINED = 0.25, 0.4, 0.15, 0.5, 2.0
 # A waveform that is so often near one of its levels is no hum: a sine is in 41 % of its samples.
 _AT_LEVELS, _CLOSE = 0.6, 0.1
+# Samples of an edge that are kept at most, and how often a line is fitted to those in the band.
+_LONGEST, _ROUNDS = 1 << 16, 3
 _SECOND = 0.6745 * math.sqrt(6.0)  # median of second differences of white noise of size 1
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -308,51 +310,77 @@ class SchmittTrigger:
     """
     Find the threshold crossings in a stream of blocks of finite samples of any size.
 
+    Interpolated, a crossing is that of the straight line through the samples of the edge that are
+    as near as their noise may bring them, two at least: the more there are, the less it moves it.
+
     :param interpolate: False puts a crossing on the first sample past the threshold.
     """
 
     def __init__(self, *, interpolate: bool) -> None:
         self._interpolate = interpolate
-        self._previous: float | None = None
         self._high: bool | None = None
-        self._crossing: float | None = None  # the last one, not yet confirmed
+        self._kept: FloatArray = np.empty(0)  # from the last sample outside the band on
 
-    def update(self, samples: FloatArray, index: int, threshold: float, band: float
-               ) -> tuple[FloatArray, BoolArray]:
+    def update(self, samples: FloatArray, index: int, threshold: float, band: float,
+               near: float) -> tuple[FloatArray, BoolArray]:
         """
         Return the crossings that these samples (n,) confirm and which of them rise, (c,) each.
 
         `index` is that of the first sample in the stream. Crossings are given as such indices,
-        fractional if interpolated. `band` is half the hysteresis, in the unit of the samples.
-        Before the signal first leaves the band there are no crossings.
+        fractional if interpolated. `band` is half the hysteresis, in the unit of the samples, and
+        `near` how far noise may bring them. Before the signal first leaves the band there are no
+        crossings.
         """
-        if self._previous is None:
-            self._previous = float(samples[0])
-        signal = np.concatenate(([self._previous], samples))
+        kept = self._kept if self._kept.size else samples[:1]
+        signal = np.concatenate((kept, samples))
         above = signal >= threshold
-        after = np.flatnonzero(above[1:] != above[:-1])  # first sample past the threshold
-        positions = (index + after).astype(np.float64)
-        if self._interpolate:
-            before, past = signal[after], signal[after + 1]
-            positions += (threshold - before) / (past - before) - 1.0
+        after = np.flatnonzero(above[1:] != above[:-1]) + 1  # first sample past the threshold
         high = samples >= threshold + band
-        decided = np.flatnonzero(high | (samples < threshold - band))
-        level = high[decided]
-        if self._high is None and decided.size:
+        outside = np.flatnonzero(high | (samples < threshold - band))
+        level = high[outside]
+        if self._high is None and outside.size:
             self._high = bool(level[0])
         changes = np.flatnonzero(level != np.append(bool(self._high), level)[:-1])
-        confirmed, rising = decided[changes], level[changes]
+        outside += kept.size
+        begin, end = np.append(0, outside)[changes], outside[changes]
         # The last crossing before the decision has the direction of the change, even if noise
         # made the signal cross the threshold several times inside the band.
-        last = np.searchsorted(after, confirmed, side='right') - 1
-        unconfirmed = np.nan if self._crossing is None else self._crossing
-        found = np.where(last >= 0, np.append(positions, unconfirmed)[last], unconfirmed)
-        found = np.where(np.isnan(found), index + confirmed, found)
-        if after.size:
-            self._crossing = float(positions[-1])
-        if decided.size:
+        last = np.append(0, after)[np.searchsorted(after, end, side='right')]
+        crossed = last > begin  # or the threshold has moved
+        last = np.where(crossed, last, end)
+        found = (index - kept.size + last).astype(np.float64)
+        if self._interpolate:
+            found[crossed] += _before(signal - threshold, near, begin[crossed], last[crossed],
+                                      end[crossed])
+        if outside.size:
             self._high = bool(level[-1])
-            if not after.size or after[-1] <= decided[-1]:
-                self._crossing = None
-        self._previous = float(samples[-1])
-        return found, rising
+        self._kept = signal[max(outside[-1] if outside.size else 0, signal.size - _LONGEST):]
+        return found, level[changes]
+
+
+def _before(signal: FloatArray, near: float, begin: IntArray, last: IntArray, end: IntArray
+            ) -> FloatArray:
+    """
+    Return where edges pass 0 (edge,), in samples from the `last` time at which they cross it.
+
+    An edge is from the sample `begin` to `end`. A line is fitted to as many samples in front of
+    the crossing as behind it, and again to those where it is `near` 0.
+    """
+    lowest, highest = begin - last, end - last if near else np.zeros_like(last)
+    low, high, found = np.maximum(lowest, -1 - highest), highest, np.zeros(0)
+    for _ in range(_ROUNDS if last.size else 0):
+        count = high - low + 1
+        starts = np.cumsum(count) - count
+        place = np.arange(count.sum()) - np.repeat(starts, count)
+        values = signal[place + np.repeat(last + low, count)]
+        mean = np.add.reduceat(values, starts) / count
+        moment = np.add.reduceat(values * (place - np.repeat(0.5 * (count - 1), count)), starts)
+        slope = 12.0 * moment / (count * (count**2 - 1.0))
+        slope = np.where(np.abs(slope) > _TINY, slope, _TINY)
+        found = np.clip(0.5 * (low + high) - mean / slope, lowest, highest)
+        if count.max() == 2:  # steep edges
+            break
+        reach = np.minimum(near / np.abs(slope), highest - lowest)
+        low = np.clip(np.ceil(found - reach).astype(np.int64), lowest, -1)
+        high = np.clip(np.floor(found + reach).astype(np.int64), 0, highest)
+    return found
