@@ -63,7 +63,7 @@ def test_core_is_as_accurate_as_its_page_says(benchmark):
 
 @pytest.mark.machines
 @pytest.mark.parametrize('values', [
-    {'snr': 0.0}, {'snr': 10.0}, {'snr': 10.0, 'scale': 5.0}, {'snr': 20.0, 'ratio': 0.25},
+    {'snr': 0.0}, {'snr': 10.0, 'scale': 5.0}, {'snr': 20.0, 'ratio': 0.25},
     {'snr': 15.0, 'cycles': 10}])
 def test_a_corrected_amplitude_is_no_worse_and_not_biased(benchmark, values):
     campaign = benchmark('correction_campaign')
@@ -142,10 +142,9 @@ def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, 
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('cycles', [5, 10])
-def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
+def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark):
     coverage, trials = benchmark('interval_coverage'), 200
-    raw, _ = coverage.coverage(coverage.Case(cycles, 40.0, 0.8, correct=False), trials, seed=1)
+    raw, _ = coverage.coverage(coverage.Case(5, 40.0, 0.8, correct=False), trials, seed=1)
     # of few cycles in so large a jitter they are too safe, by up to 10 points (docs/theory.md)
     for width, wanted, safe in ((1.0, 0.683, 0.1), (1.96, 0.95, 0.03)):
         off = np.mean(np.abs(raw.amplitude['absent']) < width) - wanted
@@ -243,6 +242,7 @@ def test_machines_of_another_simulator_attenuate_as_theory_says(benchmark):
 @pytest.mark.parametrize(('effects', 'seed', 'row'), [
     ((), 4, '| declared model | 1 | 1 | 1 - |'),  # an order between the lines of the trigger cycle
     (('excess_jitter',), 0, '| excess_jitter | 1 | 1 | 1 excess_jitter |')])
+@pytest.mark.usefixtures('unasked')
 def test_loop_is_judged_on_machines_of_another_simulator(benchmark, tmp_path, effects, seed, row):
     confusion = benchmark('independent_confusion')
     run = confusion.judge(effects, seed, tmp_path)
@@ -307,10 +307,10 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
 
 @pytest.mark.campaign
 def test_fault_replay_finds_no_wrong_average(benchmark, capsys):
-    assert benchmark('fault_replay').main(['--scenes', '3', '--seed', '70001']) == 0
+    assert benchmark('fault_replay').main(['--scenes', '2', '--seed', '70001']) == 0
     for line in capsys.readouterr().out.splitlines():
         scenes, averages, wrong = re.findall(r'\d+', line)
-        assert (int(scenes), int(wrong)) == (3, 0)
+        assert (int(scenes), int(wrong)) == (2, 0)
         assert int(averages) > 7
 
 
@@ -356,8 +356,8 @@ def test_soak_follows_memory_and_writes_its_page(process_environment, tmp_path):
 @pytest.mark.campaign
 def test_months_of_averages_are_simulated(benchmark):
     monitor = benchmark('change_monitor')
-    found, years = monitor.false_alarms(monitor.CASES[0], 24, 1.0 / 12.0, seed=1)
-    assert years == pytest.approx(2.0, rel=0.01)
+    found, years = monitor.false_alarms(monitor.CASES[0], 12, 1.0 / 12.0, seed=1)
+    assert years == pytest.approx(1.0, rel=0.01)
     assert found <= years + 4.0 * np.sqrt(years)
     faults = [*monitor.detections(30, seed=2, months=3)]
     assert len(faults) >= 15  # others had an alarm before, one a year, or began later
@@ -375,6 +375,7 @@ def test_a_damaged_recording_ends_in_one_line_or_with_a_report(benchmark, capsys
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('unasked')
 def test_the_loop_counts_marks_alike_in_recordings_that_begin_at_any_of_them(benchmark, capsys):
     compare = benchmark('channels_and_cuts')
     assert compare.main([

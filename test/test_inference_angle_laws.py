@@ -34,6 +34,7 @@ from sa_jitter_ros.simulation.gearbox import Gearbox
 from worse_pulses import with_added_jitter, with_slower_clock
 import yaml
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, SPEED, CYCLES, JITTER = 5000.0, 25.0, 20, 2e-4
 LAWS = ('linear', 'quadratic', 'spline')
 MODEL = DeclaredModel(

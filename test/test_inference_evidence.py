@@ -32,6 +32,7 @@ from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, SPEED, CYCLES = 6000.0, 25.0, 20
 
 

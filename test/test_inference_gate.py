@@ -31,6 +31,7 @@ from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, DeclaredJitter, Gearbox, Keyphasor, make_effects, mesh)
 from scipy.interpolate import CubicSpline
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, SPEED, CYCLES, NOISE = 4096.0, 25.0, 20, 0.05
 ORDERS = (8.0, 16.0, 24.0)
 DECLARED = {'keyphasor_rate': 5000.0, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,

@@ -26,6 +26,7 @@ from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.report import report, summary
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, make_effects, mesh
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, SPEED, CYCLES, NOISE = 5000.0, 25.0, 20, 0.05
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
                       orders=(8.0, 16.0, 24.0), noise_std=NOISE, sample_rate=RATE)

@@ -22,6 +22,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.report import report
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, DURATION, JITTER, NOISE = 20e3, 12.0, 12e-6, 0.2
 ORDERS = 23.0, 46.0
 

@@ -30,6 +30,7 @@ from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from validation.analytic import normal_mean
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, SPEED, CYCLES, NOISE, ACQUISITIONS = 5000.0, 25.0, 20, 0.05, 16
 JITTER = 1.0 / math.sqrt(12.0) / 5000.0
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,

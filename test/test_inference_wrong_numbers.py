@@ -24,6 +24,7 @@ from sa_jitter_ros.report.report import report
 from sa_jitter_ros.report.words import findings
 import yaml
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATE, SPEED, CYCLES, NOISE, SECONDS = 4000.0, 16.0, 16, 0.3, 26.0
 ORDERS, SIZES = (20.0, 40.0, 60.0), (1.0, 0.7, 0.8)
 MODEL = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
