@@ -242,7 +242,6 @@ def test_machines_of_another_simulator_attenuate_as_theory_says(benchmark):
 @pytest.mark.parametrize(('effects', 'seed', 'row'), [
     ((), 4, '| declared model | 1 | 1 | 1 - |'),  # an order between the lines of the trigger cycle
     (('excess_jitter',), 0, '| excess_jitter | 1 | 1 | 1 excess_jitter |')])
-@pytest.mark.usefixtures('unasked')
 def test_loop_is_judged_on_machines_of_another_simulator(benchmark, tmp_path, effects, seed, row):
     confusion = benchmark('independent_confusion')
     run = confusion.judge(effects, seed, tmp_path)
@@ -288,7 +287,7 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
     page = tmp_path / 'reliability.md'
     page.write_text((ROOT / 'docs' / 'reliability.md').read_text())
     done = subprocess.run(
-        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '2', '--seed', '3', '--numbers',
+        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '3', '--seed', '3', '--numbers',
          tmp_path / 'faults.json', '--page', page, '--figures', tmp_path], capture_output=True,
         env={**process_environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)}, text=True,
         check=False)
@@ -307,10 +306,10 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
 
 @pytest.mark.campaign
 def test_fault_replay_finds_no_wrong_average(benchmark, capsys):
-    assert benchmark('fault_replay').main(['--scenes', '2', '--seed', '70001']) == 0
+    assert benchmark('fault_replay').main(['--scenes', '3', '--seed', '70001']) == 0
     for line in capsys.readouterr().out.splitlines():
         scenes, averages, wrong = re.findall(r'\d+', line)
-        assert (int(scenes), int(wrong)) == (2, 0)
+        assert (int(scenes), int(wrong)) == (3, 0)
         assert int(averages) > 7
 
 
@@ -375,7 +374,6 @@ def test_a_damaged_recording_ends_in_one_line_or_with_a_report(benchmark, capsys
 
 
 @pytest.mark.machines
-@pytest.mark.usefixtures('unasked')
 def test_the_loop_counts_marks_alike_in_recordings_that_begin_at_any_of_them(benchmark, capsys):
     compare = benchmark('channels_and_cuts')
     assert compare.main([

@@ -61,11 +61,15 @@ CASES = {
 @pytest.mark.parametrize('name', CASES)
 def test_effect_is_found_with_its_size(name):
     sizes, (parameter, truth) = CASES[name]
-    timing = read_timing([machine(0, **sizes)])
-    assert names_of(timing) == {name}
-    value, error = value_of(timing, name, parameter)
-    assert abs(value - truth) < 4.0 * error
-    assert timing.probabilities[name] > 0.45  # half of it, where two names share the power
+    off = []
+    for seed in range(2):
+        timing = read_timing([machine(seed, **sizes)])
+        assert names_of(timing) == {name}, seed
+        value, error = value_of(timing, name, parameter)
+        off.append((value - truth) / error)
+        assert timing.probabilities[name] > 0.45  # half of it, where two names share the power
+    assert np.max(np.abs(off)) < 4.0
+    assert np.sqrt(np.mean(np.square(off))) < 2.0
 
 
 @pytest.mark.machines
