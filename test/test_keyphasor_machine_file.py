@@ -214,7 +214,7 @@ RECORDINGS = [
     ('encoder_motor_slow', {})]
 #: Marks, missing teeth, clock in Hz and mean speed in Hz, of which the check is told nothing.
 KNOWN = {'gear0_gearbox': (1, 0, None, 33.33), 'motor_30V_100kHz': (8, 0, 100e3, 94.4),
-         'motor_runup_20V_40kHz': (8, 0, 40e3, 39.5), 'turbine_20130316': (2, 0, 1e8, 30.03)}
+         'motor_runup_20V_40kHz': (8, 0, 40e3, 38.3), 'turbine_20130316': (2, 0, 1e8, 30.03)}
 
 
 def cut(recording, seconds, channels=None):

@@ -329,6 +329,19 @@ def test_slow_edges_in_noise_are_one_pulse_each(shape, rng):
         assert abs(pulses.size - 4.0 * speed) < 1.0
 
 
+@pytest.mark.machines
+@given(st.integers(0, 9999), st.sampled_from([0.1, 1e-9, 1e9]), st.integers(1, 4))
+@settings(max_examples=40)
+def test_coarse_steps_in_noise_have_finite_times(seed, unit, steps):
+    """Some lines through few samples of a few steps have no slope."""
+    rng = np.random.default_rng(seed)
+    turn = rng.uniform(5.0, 60.0) * np.arange(6000) / 3000.0
+    wave = np.rint(steps * np.sin(2.0 * np.pi * turn) + rng.normal(0.0, 0.6, turn.size))
+    pulses, _ = detect(unit * wave, rate=3000.0, hysteresis=rng.uniform(0.01, 0.5))
+    assert np.all(np.isfinite(pulses))
+    assert np.all(np.diff(pulses) > 0.0)
+
+
 @pytest.mark.parametrize('rate', [12.8e3, 51.2e3])
 def test_noise_of_slow_edges_is_averaged_over_their_samples(rate, rng):
     """

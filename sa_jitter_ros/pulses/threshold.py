@@ -376,7 +376,7 @@ def _before(signal: FloatArray, near: float, begin: IntArray, last: IntArray, en
         mean = np.add.reduceat(values, starts) / count
         moment = np.add.reduceat(values * (place - np.repeat(0.5 * (count - 1), count)), starts)
         slope = 12.0 * moment / (count * (count**2 - 1.0))
-        slope = np.where(np.abs(slope) > _TINY, slope, _TINY)
+        slope = np.where(np.abs(slope) > near / _LONGEST, slope, near / _LONGEST)
         found = np.clip(0.5 * (low + high) - mean / slope, lowest, highest)
         if count.max() == 2:  # steep edges
             break
