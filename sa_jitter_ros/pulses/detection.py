@@ -88,7 +88,8 @@ class KeyphasorDetector:
     size, moves them for longer. Up to three samples that are farther from all others than these
     are apart are a spike, and are bridged. If no `threshold` is given, pulses with a lobe on
     either side of the resting level, as a variable reluctance sensor makes them, have the time of
-    the steep crossing between the lobes.
+    the steep crossing between the lobes. The time of a slow edge in noise is that of the straight
+    line through its samples.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
     :param hysteresis: width of the band around the threshold, a fraction of the level difference;
