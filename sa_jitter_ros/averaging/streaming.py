@@ -475,9 +475,9 @@ class StreamingAverager:
         if correction is not None and correction.refitted:
             self.counts.pulses_refitted += correction.refitted
             self._messages.append(
-                f'{correction.refitted} pulses from {average.start_time:.6f} s to '
-                f'{average.end_time:.6f} s have errors that no jitter explains: the correction '
-                'takes them for missing ones, the raw average does not; check the tach, and set '
+                f'pulses from {average.start_time:.6f} s to {average.end_time:.6f} s with errors '
+                f'that no jitter explains: {correction.refitted}; the correction takes them for '
+                'missing ones, the raw average does not; check the tach, and set '
                 'interval_tolerance to 0')
 
     def _discard(self, count: int, why: str) -> None:
