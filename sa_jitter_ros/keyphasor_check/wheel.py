@@ -167,7 +167,7 @@ class _Evidence:
         """
         Return the log likelihood of a target of so many teeth, less half a log n a value.
 
-        It is over that of even teeth where the target has pulses.
+        Of the places it is that over the one of even teeth, for the pulses on the target alone.
         """
         classes = self._numbers % teeth
         seen, span = _seen_of(self._numbers, teeth)

@@ -350,21 +350,21 @@ class SchmittTrigger:
         last = np.where(crossed, last, end)
         found = (index - kept.size + last).astype(np.float64)
         if self._interpolate:
-            found[crossed] += _before(signal - threshold, near, begin[crossed], last[crossed],
+            found[crossed] += _before(signal, threshold, near, begin[crossed], last[crossed],
                                       end[crossed])
         if outside.size:
             self._high = bool(level[-1])
-        self._kept = signal[max(outside[-1] if outside.size else 0, signal.size - _LONGEST):]
+        self._kept = signal[max(np.append(0, outside)[-1], signal.size - _LONGEST):].copy()
         return found, level[changes]
 
 
-def _before(signal: FloatArray, near: float, begin: IntArray, last: IntArray, end: IntArray
-            ) -> FloatArray:
+def _before(signal: FloatArray, threshold: float, near: float, begin: IntArray, last: IntArray,
+            end: IntArray) -> FloatArray:
     """
-    Return where edges pass 0 (edge,), in samples from the `last` time at which they cross it.
+    Return where edges pass the threshold (edge,), in samples from the `last` one behind it.
 
     An edge is from the sample `begin` to `end`. A line is fitted to as many samples in front of
-    the crossing as behind it, and again to those where it is `near` 0.
+    the crossing as behind it, and again to those where it is `near` the threshold.
     """
     lowest, highest = begin - last, end - last if near else np.zeros_like(last)
     low, high, found = np.maximum(lowest, -1 - highest), highest, np.zeros(0)
@@ -372,7 +372,7 @@ def _before(signal: FloatArray, near: float, begin: IntArray, last: IntArray, en
         count = high - low + 1
         starts = np.cumsum(count) - count
         place = np.arange(count.sum()) - np.repeat(starts, count)
-        values = signal[place + np.repeat(last + low, count)]
+        values = signal[place + np.repeat(last + low, count)] - threshold
         mean = np.add.reduceat(values, starts) / count
         moment = np.add.reduceat(values * (place - np.repeat(0.5 * (count - 1), count)), starts)
         slope = 12.0 * moment / (count * (count**2 - 1.0))
