@@ -287,7 +287,7 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
     page = tmp_path / 'reliability.md'
     page.write_text((ROOT / 'docs' / 'reliability.md').read_text())
     done = subprocess.run(
-        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '3', '--seed', '3', '--numbers',
+        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '2', '--seed', '3', '--numbers',
          tmp_path / 'faults.json', '--page', page, '--figures', tmp_path], capture_output=True,
         env={**process_environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)}, text=True,
         check=False)
