@@ -195,3 +195,19 @@ def test_declared_lines_only_are_used_where_the_others_disturb(shared_data):
                            RecordPulses.unbroken(times[1:-1]), model)
     assert found.undeclared[0].size == 0
     assert np.std(found.errors - true) < 0.7 * np.std(found.fits[0].errors - true)
+
+
+@pytest.mark.parametrize('order', [2.0, 2.8])  # of a cycle from mark to mark of five
+def test_a_line_in_noise_lets_no_chance_choose_the_acquisitions(rng, order):
+    """Where no pulse error is resolved, chance resolves the ripple of some acquisitions."""
+    speed, clock, rate = 350.0, 55000.0, 2900.0
+    time = np.arange(int(10.0 * rate)) / rate
+    vibration = 0.35 * np.cos(2.0 * np.pi * order * speed * time)
+    vibration += 0.38 * rng.standard_normal(time.size)
+    pulses = np.arange(0.1, 9.9, 1.0 / speed)
+    pulses += rng.uniform(-0.5, 0.5, pulses.size) / clock
+    model = DeclaredModel(keyphasor_rate=clock, trigger_speed=speed, trigger_cycles=10,
+                          orders=(order,), sample_rate=rate, noise_std=0.38)
+    found = observe(Recording(ArraySource(vibration[None]), rate, pulse_times=pulses), model)
+    recovered = sum(item.recovered for item in found.acquisitions)
+    assert recovered == 0, f'{recovered} of {len(found.acquisitions)}'

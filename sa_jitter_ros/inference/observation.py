@@ -377,9 +377,9 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     late = late - late[measured].mean() * common_turn(bridged - late, measured)
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
     ripple = recovery.ripple[span.start + measured[:-1]]
-    noise = recovery.ripple_standard_error**2
-    resolved = noise < RESOLVED**2 * (np.mean(ripple**2) - noise)  # false with a missing pulse
-    reason = _unresolved(bridged - late, standard_errors, recovery, model, bool(resolved))
+    # asked of all cycles: of one acquisition, chance would choose which is compared
+    resolved = recovery.ripple_resolved and bool(np.isfinite(ripple).all())
+    reason = _unresolved(bridged - late, standard_errors, recovery, model, resolved)
     corrected_pulses: FloatArray = bridged if reason else bridged - late
     law = angle_law(model.angle_law)
     used = slice(first - law.before, first + count + 1 + law.after)

@@ -99,6 +99,13 @@ class RecordRecovery:
         known = self.standard_errors[np.isfinite(self.standard_errors)]
         return bool(known.size and np.median(known) < RESOLVED * self.jitter_std)
 
+    @property
+    def ripple_resolved(self) -> bool:
+        """Tell whether the vibration shows the angle errors inside cycles, by all of them."""
+        noise = self.ripple_standard_error**2
+        known = self.ripple[np.isfinite(self.ripple)]
+        return bool(known.size and noise < RESOLVED**2 * (np.mean(known**2) - noise))
+
 
 def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
                    model: DeclaredModel, *,
