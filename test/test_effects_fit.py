@@ -11,6 +11,7 @@
 """Fitted parameters lie within their stated standard errors, on drawn evidence."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
@@ -231,9 +232,29 @@ def test_orders_that_change_each_by_itself_have_no_common_gain(
         draws, acquisitions, noise.size)).swapaxes(2, 3)
     values = slow + noise * rng.standard_normal(slow.shape)
     found = [fit_common_gain(radial, noise) for radial in values]
-    gains = [beyond_chance(item.likelihood, item.bands, acquisitions * cycles) for item in found]
+    gains = [beyond_chance(item.likelihood, item.powers.size, acquisitions * cycles)
+             for item in found]
     assert np.mean(gains) < 0.0
     assert np.mean(np.array(gains) > ODDS) < 0.01
+
+
+def test_size_and_width_of_a_gain_are_as_wrong_as_their_errors_say(rng):
+    """Of any width: one that is slower than an acquisition leaks into all frequencies of it."""
+    off = []
+    for _ in range(150):
+        acquisitions, cycles, orders = rng.integers((10, 10, 2), (60, 40, 5))
+        std, width = rng.uniform(0.05, 0.3), math.exp(rng.uniform(math.log(0.5 / cycles), -0.9))
+        frequency = (np.arange(2000) + 0.5) / 2000.0 * width
+        correlation = np.mean(np.sinc(frequency) ** 2 * np.cos(2.0 * np.pi * np.multiply.outer(
+            np.arange(cycles), frequency)), axis=1)
+        noise = rng.uniform(0.02, 0.1, orders)
+        gain = std * stationary(rng, correlation + 1e-9 * np.eye(cycles)[0], acquisitions)
+        found = fit_common_gain(gain[..., None] + noise * rng.standard_normal(
+            (acquisitions, cycles, orders)), noise).size_and_width()
+        off.append([(value - true) / error for (value, error), true in zip(found, (std, width))])
+    assert np.abs(np.mean(off, axis=0)).max() < 0.3
+    assert 0.65 < np.std(off, axis=0).min()
+    assert np.std(off, axis=0).max() < 1.35
 
 
 @pytest.mark.parametrize(('std', 'band'), [

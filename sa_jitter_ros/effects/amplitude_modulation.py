@@ -21,13 +21,12 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, memory, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
-from sa_jitter_ros.effects.common_gain import CommonGain, fit_common_gain
+from sa_jitter_ros.effects.common_gain import correlations, fit_common_gain
 from sa_jitter_ros.effects.effect import (
     absent, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
-from sa_jitter_ros.effects.evidence import Evidence, root
+from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import special
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,8 @@ class AmplitudeModulation(DirectEffect):
             product = ((radial @ weight) ** 2 - radial**2 @ weight**2) / pairs  # of others
         power = largest_power(float(product.mean()), product.size, known, square,
                               memory(SLOW_BAND))
-        return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
+        of_cycle = float(correlations(np.array(SLOW_BAND[1:]), 1)[0, 0])
+        return cls(min(math.sqrt(power / of_cycle), 1.0))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -118,36 +118,11 @@ class AmplitudeModulation(DirectEffect):
         if not noise.size:
             return absent(cls.name, 'no line is compared')
         found = fit_common_gain(radial, noise)
-        if found.slow + found.fast == 0.0:
+        if not found.powers.any():
             return absent(cls.name, 'the one order that is compared scatters as noise does')
-        bandwidth, bandwidth_error = _bandwidth_of(found, radial.shape[1])
-        within = _variance_of_mean(1, slow_band(bandwidth))
-        std, std_error = root((found.slow + found.fast) / within,
-                              math.hypot(found.slow_error, found.fast_error) / within)
+        (std, std_error), (bandwidth, bandwidth_error) = found.size_and_width()
         text = f'the amplitudes of all lines grow and shrink together by {std:.2%}'
         return weighed(Finding(
             cls.name, cls(min(std, 1.0), bandwidth),
             {'std': std_error, 'bandwidth': bandwidth_error}, 1.0, text),
-            found.likelihood, found.bands, evidence)
-
-
-def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:
-    """Return the variance of the mean over some cycles of a unit modulation."""
-    x = cycles * np.array(band)
-    integral = special.sici(2.0 * np.pi * x)[0] / np.pi - x * np.sinc(x) ** 2
-    return float(np.diff(integral)[0] / np.diff(x)[0])  # of sinc(x)^2
-
-
-def _bandwidth_of(found: CommonGain, cycles: int) -> tuple[float, float]:
-    """Return the bandwidth that averages of some cycles show beside single ones, and its error."""
-    widths = np.geomspace(NARROWEST, WIDEST, 200)
-    bands = [slow_band(width) for width in widths]
-    shares = np.array([_variance_of_mean(cycles, band) / _variance_of_mean(1, band)
-                       for band in bands])
-    total = found.slow + found.fast
-    share = found.slow / total
-    error = math.hypot(found.fast * found.slow_error, found.slow * found.fast_error) / total**2
-    low, bandwidth, high = np.exp(np.interp(
-        [share + error, share, share - error], np.minimum.accumulate(shares)[::-1],
-        np.log(widths)[::-1]))
-    return float(bandwidth), float(max(high - bandwidth, bandwidth - low))  # one side may end
+            found.likelihood, found.powers.size, evidence)

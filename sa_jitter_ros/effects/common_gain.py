@@ -17,14 +17,20 @@ order alone changes by itself as noise does, by the power of the highest octave 
 """
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.band import NARROWEST, WIDEST
 from sa_jitter_ros.effects.effect import ONE_SIDED
 from sa_jitter_ros.effects.timing import LARGE
+from scipy import linalg, special
 from scipy.optimize import minimize
 
 _LEAST = 0.1  # of the noise: what a line changes by itself at least
+_WIDER = 5.0  # than all that is there, or smaller, is the gain at most
+_TRIED, _ROUNDS = 80, 4  # sizes and widths, closer to what is likely each time
+_LONGEST = 1000  # cycles whose ordinates are compared one by one
 
 
 @dataclass(frozen=True)
@@ -32,17 +38,86 @@ class CommonGain:
     """
     A gain that all orders share.
 
-    `likelihood` is the gain in log likelihood by its power in so many `bands`; `slow` is the
-    variance of its means over the cycles of an acquisition, `fast` that within acquisitions, and
-    `slow_error` and `fast_error` are their standard errors.
+    `likelihood` is the gain in log likelihood by its power. `powers` (octave,) are the means over
+    the ordinates of windows of so many `cycles`, of which `first` (octave,) begin the octaves;
+    `errors` (octave,) are their standard errors, `counts` (ordinate,) the numbers of ordinates.
     """
 
     likelihood: float
-    bands: int
-    slow: float
-    slow_error: float
-    fast: float
-    fast_error: float
+    powers: Array
+    errors: Array
+    cycles: int
+    first: Array
+    counts: Array
+
+    def size_and_width(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """
+        Return standard deviation and bandwidth of the gain, each with its standard error.
+
+        They are means and standard deviations over all sizes and widths of a flat band, which are
+        as likely as the octaves are with them and the noise that their errors show (Whittle).
+        """
+        counts = np.add.reduceat(self.counts, self.first)
+        noise = np.maximum(self.errors * np.sqrt(counts) - self.powers, _LEAST * self.powers)
+        total = math.sqrt(float(self.powers @ counts) / float(np.sum(counts)))
+        sizes, widths, share = (total / _WIDER, total * _WIDER), (NARROWEST, WIDEST), 1.0
+        for _ in range(_ROUNDS):
+            tried, width = np.geomspace(*sizes, _TRIED), np.geomspace(*widths, _TRIED)
+            shown = np.add.reduceat(self.counts * ordinates_of_band(width, self.cycles),
+                                    self.first, axis=1) / counts
+            expected = tried[:, None, None] ** 2 * shown + noise
+            value = -share * np.sum(counts * (
+                np.log(expected) + (self.powers + noise) / expected), axis=2)
+            likely = np.exp(value - value.max())
+            likely /= likely.sum()
+            std = _moments(tried, likely.sum(axis=1))
+            bandwidth = _moments(width, likely.sum(axis=0))
+            sizes, widths = _closer(tried, std), _closer(width, bandwidth)
+            # a gain that is slower than the windows is the same in several of them
+            share = min(1.0, 2.0 * bandwidth[0] * self.cycles) / self._dependence(
+                std[0], bandwidth[0], noise)
+        return std, bandwidth
+
+    def _dependence(self, std: float, bandwidth: float, noise: Array) -> float:
+        """Return how many ordinates are one independent one: a slow gain leaks into all."""
+        each = np.repeat(noise, np.diff([*self.first, self.counts.size]))[:_LONGEST // 2]
+        cycles = min(self.cycles, _LONGEST)  # of which as narrow a band leaks alike
+        width = min(bandwidth * self.cycles / cycles, WIDEST)
+        lagged = std**2 * correlations(np.array([width]), cycles)[0]
+        waves = np.fft.ifft(np.fft.rfft(linalg.toeplitz(lagged), axis=0), axis=1)
+        both = np.abs(waves[:each.size, :each.size] + np.diag(each)) ** 2
+        scale = np.sqrt(np.diag(both))
+        return float(np.sum(both / np.outer(scale, scale))) / each.size
+
+
+def _moments(values: Array, weight: Array) -> tuple[float, float]:
+    """Return mean and standard deviation."""
+    mean = float(values @ weight)
+    return mean, math.sqrt(float((values - mean) ** 2 @ weight))
+
+
+def _closer(values: Array, found: tuple[float, float]) -> tuple[float, float]:
+    """Return the range of `values` that is likely, and as far as they do not tell."""
+    away = 5.0 * found[1] + 2.0 * found[0] * (values[1] / values[0] - 1.0)
+    return max(values[0], found[0] - away), min(values[-1], found[0] + away)
+
+
+def correlations(widths: Array, cycles: int) -> Array:
+    """
+    Return the autocorrelation (width, lag) of the means in cycles of unit gains.
+
+    The gains have flat spectra from 0 up to the `widths`, in cycles a trigger cycle.
+    """
+    rate, lag = 2.0 * np.pi * widths[:, None], np.arange(-1.0, cycles + 1.0)
+    # the second integral of that of the gains
+    twice = (lag * special.sici(rate * lag)[0] + (np.cos(rate * lag) - 1.0) / rate) / rate
+    return np.asarray(np.diff(twice, 2))
+
+
+def ordinates_of_band(widths: Array, cycles: int) -> Array:
+    """Return the mean power of the ordinates (width, ordinate) of such gains."""
+    weighted = correlations(widths, cycles) * (1.0 - np.arange(cycles) / cycles)
+    return np.asarray(2.0 * np.fft.rfft(weighted).real - weighted[:, :1])
 
 
 def fit_common_gain(radial: Array, noise: Array) -> CommonGain:
@@ -68,10 +143,7 @@ def fit_common_gain(radial: Array, noise: Array) -> CommonGain:
     else:
         likelihood, size, error = np.array([
             _shared(own / number, number, 1.0 / noise) for own, number in zip(powers, counts)]).T
-    share = 2.0 * counts[1:] / (acquisitions * cycles)
-    return CommonGain(
-        float(likelihood.sum()), size.size, float(size[0] / cycles), float(error[0] / cycles),
-        float(share @ size[1:]), float(np.sqrt(share**2 @ error[1:] ** 2)))
+    return CommonGain(float(likelihood.sum()), size, error, cycles, np.array(edges), count)
 
 
 def _above_noise(powers: Array, counts: Array) -> tuple[Array, Array, Array]:
