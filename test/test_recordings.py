@@ -739,7 +739,8 @@ def test_csv_with_lines_below_the_table(tmp_path, footer):
 @pytest.mark.parametrize(('column', 'why'), [
     (lambda k: str(k), 'rises evenly'), (lambda k: str(k + 1), 'rises evenly'),
     (lambda k: f'{1.7e12 + k:.0f}', 'rises evenly'),
-    (lambda k: f'12:00:{k // 20:02d}', 'has times that repeat'), (lambda k: 'ok', 'holds text')])
+    (lambda k: f'12:00:{k // 20:02d}', 'has times that repeat'), (lambda k: 'ok', 'holds text'),
+    (lambda k: '' if k % 3 else '20.5', 'is empty in most rows')])
 def test_csv_column_that_holds_no_samples_is_said_and_left_out(tmp_path, column, why):
     (tmp_path / 'log.csv').write_text('when,a,b\n' + ''.join(
         ','.join((column(k), *row[1:])) + '\n' for k, row in enumerate(ROWS)))
@@ -763,9 +764,12 @@ def test_csv_cells_without_a_number_are_gaps(rng, tmp_path):
     rows = [[f'{k / RATE:.9g}', str(a[k]), str(b[k])] for k in range(500)]
     rows[100][1], rows[101][2] = '', ' '
     rows[200][1], rows[300][1] = '\N{INFINITY}', '-\N{INFINITY}'
+    rows[0][2], rows[1][1:] = '', ('', '')  # the names above them are kept
     (tmp_path / 'rig.csv').write_text('time,a,b\n' + '\n'.join(map(','.join, rows)), 'utf-8')
-    a[[100, 200, 300]] = b[101] = np.nan
-    np.testing.assert_array_equal(read(tmp_path / 'rig.csv').read(), [a, b])
+    a[[1, 100, 200, 300]] = b[[0, 1, 101]] = np.nan
+    opened = read(tmp_path / 'rig.csv')
+    assert opened.channel_names == ('a', 'b')
+    np.testing.assert_array_equal(opened.read(), [a, b])
     rows[400][0] = ''
     (tmp_path / 'rig.csv').write_text('time,a,b\n' + '\n'.join(map(','.join, rows)), 'utf-8')
     with pytest.raises(RecordingError, match=r'rows 0 to 500: .*give numbers only'):

@@ -101,12 +101,12 @@ class CsvLayout:
         self.names = names + [str(k) if header is None else '' for k in range(len(names), width)]
         given = ([] if units is None else self._rows[units]) + [''] * width
         self.units = [_unit(text) or _split(name)[1] for name, text in zip(self.names, given)]
-        self._clocks = {k for k in self.pattern if ':' in self._rows[start][k]}
         values = list(filter(None, self._values[start:]))
+        whole = next(row for row, numbers in zip(self._rows[start:], self._values[start:])
+                     if self.pattern <= numbers.keys())
+        self._clocks = {k for k in self.pattern if ':' in whole[k]}
         self.idle = self._idle(rows, values)
-        filled = Counter(k for each in values for k in each)
-        self.used = [k for k in sorted(filled)
-                     if k not in self.idle and 2 * filled[k] >= len(rows)]
+        self.used = sorted({k for each in values for k in each} - self.idle.keys())
         preamble = [number for number in above if header is None or number < header]
         self.remarks = [f'{len(preamble)} line{"s" * (len(preamble) > 1)} above the table '
                         'skipped: no samples'] * bool(preamble)
@@ -151,7 +151,9 @@ class CsvLayout:
         for k in sorted(set().union(*values)):
             del found[k]
             column = np.array([each.get(k, np.nan) for each in values])
-            if k in self._clocks and np.any(np.diff(column) == 0.0):
+            if 2 * np.isfinite(column).sum() < len(rows):
+                found[k] = 'is empty in most rows'
+            elif k in self._clocks and np.any(np.diff(column) == 0.0):
                 found[k] = 'has times that repeat'
             elif len(column) >= _LEAST_EVEN and constant_rate(column):
                 found[k] = _EVEN
@@ -175,7 +177,18 @@ class CsvLayout:
             before = sum(begin < sample < number for sample in samples)
             if before < _LEAST_ROWS and not self._values[number] and self._is_text(number):
                 begin = number
-        return next(sample for sample in samples if sample > begin)
+        first = next(sample for sample in samples if sample > begin)
+        above = first - 1
+        while above >= 0 and self._has_gaps(above):  # samples, where names are above them
+            above -= 1
+        return above + 1 if above >= 0 and self._is_text(above) else first
+
+    def _has_gaps(self, number: int) -> bool:
+        """Return whether a row has numbers in some columns of samples and nothing in others."""
+        row = self._rows[number]
+        filled = {k for k, text in enumerate(row) if text}
+        return bool(filled) and filled < self.pattern and len(row) > max(self.pattern) and (
+            filled == self._values[number].keys())
 
     def _header(self, above: Sequence[int]) -> tuple[int | None, int | None]:
         """Return the rows of names and of units, of those `above` the samples; None for none."""
