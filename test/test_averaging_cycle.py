@@ -19,7 +19,7 @@ import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     CycleSamples, exact_cycles, has_same_angles, joined_cycles)
-from sa_jitter_ros.averaging.shaft import average_cycles
+from sa_jitter_ros.averaging.shaft import ShaftAverager
 
 RATE, SPEED, CYCLES, START = 10e3, 10.0, 36, 0.0123
 
@@ -48,8 +48,8 @@ def test_amplitudes_of_a_cycle_are_integrals_over_it(ratio, tone):
     orders = (tone, tone + 1.0, tone + 2.3)
     run = CycleSamples.cut(samples, start_time=0.0, rate=RATE, pulses=pulses, first=0, margin=40,
                            count=CYCLES)
-    average = average_cycles([run], AverageSettings(
-        cycle_length=ratio, trigger_cycles=CYCLES, orders=orders))
+    average = ShaftAverager(AverageSettings(
+        cycle_length=ratio, trigger_cycles=CYCLES, orders=orders)).update(run)
     assert not has_same_angles(average.angle.size, ratio)
     for amplitudes, order in zip(average.cycle_amplitudes[:, 0].T, orders):
         # The gain of the interpolator is 1 to 0.001 dB.

@@ -23,7 +23,7 @@ from sa_jitter_ros.averaging.amplitude_errors import widened
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.recovered_marks import RecoveredMarks
-from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
+from sa_jitter_ros.averaging.shaft import ShaftAverager
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -871,8 +871,8 @@ def test_cycles_averaged_together_are_those_averaged_alone(law, rng):
     cut = {'start_time': 0.0, 'rate': 1e3, 'pulses': pulses, 'margin': 20}
     together = ShaftAverager(settings).update(
         CycleSamples.cut(samples, first=8, count=40, **cut))
-    alone = average_cycles((CycleSamples(samples, 0.0, 1e3, pulses, 8 + k) for k in range(40)),
-                           settings)
+    shaft = ShaftAverager(settings)
+    alone = [shaft.update(CycleSamples(samples, 0.0, 1e3, pulses, 8 + k)) for k in range(40)][-1]
     shaft = ShaftAverager(settings)
     parts = [shaft.update(CycleSamples.cut(samples, first=8 + first, count=count, **cut))
              for first, count in ((0, 1), (1, 25), (26, 14))][-1]

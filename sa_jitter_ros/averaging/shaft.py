@@ -17,7 +17,7 @@ a fraction of the same for each of them. The settings limit its memory.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from itertools import pairwise
 import math
@@ -508,26 +508,3 @@ class ShaftAverager:
 def _discarded(numbers: Sequence[int]) -> int:
     """Return how many cycles lie between those of these ascending numbers."""
     return numbers[-1] - numbers[0] + 1 - len(numbers)
-
-
-def average_cycles(cycles: Iterable[CycleSamples], settings: AverageSettings, *,
-                   first_cycle: int = 0) -> Average:
-    """
-    Return the block average of trigger cycles, as many as `settings.trigger_cycles`.
-
-    `first_cycle` is the number of the first one; the angle is 0 where cycle 0 begins.
-
-    >>> samples = np.cos(2.0 * np.pi * 4.0 * 25.0 * np.arange(2000) / 2e3)[:, None]
-    >>> pulses = 0.02 + np.arange(11) / 25.0
-    >>> cycles = [CycleSamples.cut(samples, start_time=0.0, rate=2e3, pulses=pulses, first=k,
-    ...                            margin=20) for k in range(10)]
-    >>> average = average_cycles(cycles, AverageSettings(trigger_cycles=10, orders=(4.0,)))
-    >>> abs(average.amplitudes).round(3), average.fundamental_cycles
-    (array([[1.]]), 10)
-    """
-    shaft = ShaftAverager(settings, first_cycle=first_cycle)
-    average = None
-    for cycle in cycles:
-        average = shaft.update(cycle)
-    assert average is not None
-    return average
