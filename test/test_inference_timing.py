@@ -248,6 +248,15 @@ def surest(checks, text):
     return min((check.p_value for check in checks if text in check.text), default=1.0)
 
 
+def test_ends_of_a_motion_far_above_the_jitter_are_no_other_distribution():
+    """What whitens the errors passes on much of the jump between both ends of a recording."""
+    chances = [surest(read_timing([machine(300 + k, wander=80.0, band=(0.0, 0.1))],
+                                  names=frozenset({'phase_wander'})).checks, 'distributed')
+               for k in range(5)]
+    assert min(chances) > 0.01 / len(chances)
+    assert np.mean(chances) > 0.2
+
+
 @pytest.mark.machines
 def test_source_that_moves_as_a_sine_does_is_no_random_motion():
     text = 'a sinusoid of the source'

@@ -34,6 +34,7 @@ DRAWS, SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _BESIDE = 8  # frequencies on either side of a sinusoid, that show what is there without it
 _FEWEST = 40  # pulses whose distribution is looked at
+_BEYOND = 100  # pulses that are drawn before and behind a stretch
 _FEW_VALUES = 12.0  # six swings, below which a random motion is not told from a drift
 _TAIL = 0.1  # share of the draws that are their tail
 
@@ -273,7 +274,9 @@ def _drawn(choice: Choice, item: Stretch, kind: str) -> Array:
     """Return drawn errors (draw, pulse) in units, as the recovery shows them."""
     fit, data = choice.fit, choice.fit.data
     rng = np.random.default_rng([SEED, int(item.setting.index[0])])  # others in each stretch
-    shape = DRAWS, item.errors.size
+    # neither end follows from the other, as it would in what a filter of waves makes
+    beyond = min(item.errors.size // 2, _BEYOND)
+    shape = DRAWS, item.errors.size + 2 * beyond
     power = math.exp(fit.starts[JITTER][0]) if JITTER in fit.starts else 1.0
     if kind == _TICKS:
         tick = 1.0 / (choice.setting.clock_rate * data.unit)
@@ -286,7 +289,8 @@ def _drawn(choice: Choice, item: Stretch, kind: str) -> Array:
     gain = np.abs(data.passed[:, 1, 1])
     total = fit.spectrum(fit.parameters)[:, 1, 1].real
     rest = np.sqrt(np.maximum(total - data.measured * power * gain**2, 0.0))
-    return (through(declared, gain, data) + through(rng.standard_normal(shape), rest, data))
+    drawn = through(declared, gain, data) + through(rng.standard_normal(shape), rest, data)
+    return drawn[:, beyond:-beyond]
 
 
 def _filtered(values: Array, gain: Array, data: TimingData) -> Array:
