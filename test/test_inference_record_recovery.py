@@ -211,3 +211,17 @@ def test_a_line_in_noise_lets_no_chance_choose_the_acquisitions(rng, order):
     found = observe(Recording(ArraySource(vibration[None]), rate, pulse_times=pulses), model)
     recovered = sum(item.recovered for item in found.acquisitions)
     assert recovered == 0, f'{recovered} of {len(found.acquisitions)}'
+
+
+@pytest.mark.parametrize(('noise', 'compared'), [(0.02, True), (0.5, False)])
+def test_pulses_without_errors_are_compared_where_their_recovery_costs_no_amplitude(
+        rng, noise, compared):
+    time = np.arange(int(8.0 * RATE)) / RATE
+    vibration = np.cos(2.0 * np.pi * 8.0 * SPEED * time) + noise * rng.standard_normal(time.size)
+    pulses = np.arange(0.1, 7.9, 1.0 / SPEED) + rng.uniform(-0.5, 0.5, 195) / 1e8
+    model = DeclaredModel(keyphasor_rate=1e8, trigger_speed=SPEED, trigger_cycles=CYCLES,
+                          orders=(8.0,), sample_rate=RATE, noise_std=noise)
+    found = observe(Recording(ArraySource(vibration[None]), RATE, pulse_times=pulses), model)
+    assert {item.recovered for item in found.acquisitions} == {compared}
+    if compared:
+        assert np.abs(found.stacked('attenuation')[..., 0] - 1.0).max() < 3e-3

@@ -24,6 +24,7 @@ the on-line averager (`averaging/shaft.py`).
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+import math
 
 import numpy as np
 from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray, FloatArray, IntArray
@@ -53,6 +54,7 @@ CHANCE = 4
 #: Of the strongest channel's amplitude of an order, from which on a line is worth comparing.
 STRONG = 0.2
 _OTHER_MACHINE = 5.0
+_HARMLESS = 3e-4  # of an amplitude, a tenth of what residuals are to be accurate to
 _LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
 
 
@@ -417,12 +419,14 @@ def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: Re
     Return why the errors of an acquisition tell nothing of its amplitudes, '' if they do.
 
     The `bends` of the angle inside the cycles tell of them where the errors of pulses do not.
+    Errors that are right enough not to cost any order amplitude tell how little the pulses do.
     """
     size = max(float(np.sqrt(model.distribution.variance)), recovery.size)
     typical = float(np.sqrt(np.mean(standard_errors**2)))
     if not np.isfinite(typical):
         return 'the vibration holds no declared order'
-    if typical >= RESOLVED * size and not bends:
+    loss = 0.5 * (math.tau * max(model.orders) * model.fundamental_frequency * typical) ** 2
+    if typical >= RESOLVED * size and not bends and loss > _HARMLESS:
         return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
                 f'{RESOLVED:g} of the size of the pulse errors, {size:.3g} s')
     if np.any(np.diff(corrected) <= 0.0):
