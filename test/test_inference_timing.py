@@ -217,6 +217,22 @@ def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
 
 
 @pytest.mark.machines
+@pytest.mark.parametrize('scale', [0.0, 0.6, 1.8])
+def test_jitter_of_a_declared_scale_is_that_and_normal_jitter_comes_on_top(scale):
+    """A scale of errors that noise hides is not told from normal errors: it is as declared."""
+    declared = [EFFECTS['jitter_scale'](scale)]
+    timing = read_timing([machine(500, count=600, scale=scale, noise=2.0)], declared)
+    assert names_of(timing) <= {'jitter_scale'}
+    if scale:
+        found, error = value_of(timing, 'jitter_scale', 'scale')
+        assert abs(found - scale) < 3.5 * error
+    timing = read_timing([machine(501, count=600, scale=scale, excess=3.0)], declared)
+    assert names_of(timing) == {'excess_jitter'}
+    found, error = value_of(timing, 'excess_jitter', 'std')
+    assert abs(found - 3.0 * UNIT) < 3.5 * error
+
+
+@pytest.mark.machines
 def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
     timing = read_timing([machine([0, k], count=163, excess=1.0, skew=9.5e-5) for k in range(2)])
     assert timing.choice.best == {'clock_skew', 'jitter_scale'}

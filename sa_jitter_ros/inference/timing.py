@@ -255,7 +255,7 @@ def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> l
     found = []
     for name in sorted(choice.best):
         if name == JITTER:
-            found.append(_of_jitter(chooser, choice))
+            found.append(_of_jitter(chooser, choice, declared))
         elif name not in NO_EFFECTS and (other := _of_effect(chooser, choice, name)):
             found.append(other)
     if _CLOCK in choice.fit.columns and JITTER not in choice.best:
@@ -314,8 +314,14 @@ def _sizes(effect: Effect, errors: Mapping[str, Any]) -> str:
     return ', '.join(found)
 
 
-def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
-    """Return how large the declared jitter is, or the jitter beyond it."""
+def _of_jitter(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> Finding:
+    """
+    Return how large the declared jitter is, or the jitter beyond it.
+
+    A scale that is declared is another size of it unless the distribution says otherwise.
+    """
+    known = [item.scale for item in declared if isinstance(item, JitterScale)]
+    least = known[0] if known else 1.0
     fit, setting = choice.fit, choice.setting
     log_power, error = float(fit.starts[JITTER][0]), float(fit.standard_errors(JITTER)[0])
     scale = math.exp(0.5 * log_power)
@@ -325,18 +331,17 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
             f'{measured_text(scale, 0.5 * scale * error)} times the declared ones')
     rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
     odds = math.inf
-    if scale > 1.0:  # the same power, but the distribution tells
-        odds = chooser.of_shape(fit, scale**2) - chooser.of_shape(fit, 1.0)
-    if odds > DECIDED:
-        if scale > 1.0:
+    if scale > least:  # the same power, but the distribution tells
+        odds = chooser.of_shape(fit, scale**2) - chooser.of_shape(fit, least**2)
+    if odds > (-DECIDED if known else DECIDED):
+        if math.inf > odds > DECIDED:
             text += '; their distribution is the declared one, as wide'
         return Finding(JITTER, JitterScale(scale), {'scale': 0.5 * scale * error}, p_value, text,
                        indistinguishable_from=rivals,
                        deciding_measurement=JitterScale.deciding_measurement if rivals else '')
-    more = math.log(math.expm1(max(log_power, 1e-9)))
-    # d log(e^p - 1) = e^p / (e^p - 1) dp
+    share = max(1.0 - (least / scale) ** 2, 1e-9)  # of all power
     effect, errors = EFFECTS[EXCESS].of_timing(
-        np.array([more]), np.array([error / -math.expm1(-max(log_power, 1e-9))]), setting)
+        np.array([log_power + math.log(share)]), np.array([error / share]), setting)
     if odds > -DECIDED:
         rivals = (JITTER, *rivals)
     return Finding(EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,

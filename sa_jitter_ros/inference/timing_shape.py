@@ -90,9 +90,10 @@ class Shapes:
 
     def _density(self, errors: Array, size: float, rest: float) -> Array:
         """Return the density of errors of the declared shape with normal ones beside them."""
-        low, high = size * self.edges[:-1], size * self.edges[1:]
-        width = np.maximum(high - low, 1e-12 * size)
-        inside = ndtr((errors[:, None] - low) / rest) - ndtr((errors[:, None] - high) / rest)
+        low = size * self.edges[:-1]
+        width = np.maximum(size * np.diff(self.edges), 1e-6 * rest)  # a size of 0 is a normal one
+        inside = ndtr((errors[:, None] - low) / rest) - ndtr(
+            (errors[:, None] - low - width) / rest)
         return np.asarray(np.mean(inside / width, axis=1))
 
 
