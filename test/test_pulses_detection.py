@@ -329,6 +329,18 @@ def test_slow_edges_in_noise_are_one_pulse_each(shape, rng):
         assert abs(pulses.size - 4.0 * speed) < 1.0
 
 
+@pytest.mark.parametrize(('edge', 'width'), [(0.06, 0.25), (0.08, 0.35), (0.05, 0.15)])
+def test_noise_that_grows_costs_the_pulses_of_one_window(edge, width, rng):
+    rate, speed = 25.6e3, 20.0
+    turn = speed * np.arange(round(8.0 * rate)) / rate % 1.0 - 0.3
+    wave = 5.0 * (np.clip(turn / edge, 0.0, 1.0) - np.clip((turn - width) / edge, 0.0, 1.0))
+    wave += np.where(np.arange(turn.size) < 2.0 * rate, 0.01, 0.2) * rng.standard_normal(turn.size)
+    pulses, _ = detect(wave, rate=rate)
+    late = pulses[pulses > 2.51]
+    assert late.size == 110
+    assert np.diff(late) * speed == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.machines
 @given(st.integers(0, 9999), st.sampled_from([0.1, 1e-9, 1e9]), st.integers(1, 4))
 @settings(max_examples=40)

@@ -18,7 +18,7 @@ keyphasor.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 import warnings
 
@@ -46,6 +46,7 @@ _DRIFTED = 0.5
 # Half of the hysteresis: at least so many standard deviations of the noise, by which a slow edge
 # crosses the threshold several times, but at most this fraction of the level difference.
 _BEYOND_NOISE, _WIDEST = 4.0, 0.2
+_LOUDER = 1.5  # change of the noise that is another one
 # Part of a lobe that a signal must pass on either side of the resting level.
 _PASSED = 0.4
 # Share of the samples above the middle from which on pulses are taken for negative.
@@ -238,6 +239,8 @@ class KeyphasorDetector:
             self._pending, self._confirmed = None, True
             if not levels.resembles(known):
                 self._levels = levels
+            elif max(levels.noise, known.noise) > _LOUDER * min(levels.noise, known.noise):
+                self._levels = replace(known, noise=levels.noise)
         elif not self._confirmed or self._idle(window, known) or (
                 self._pending and levels.resembles(self._pending, _DRIFTED)):
             self._levels, self._pending, self._confirmed = levels, None, False

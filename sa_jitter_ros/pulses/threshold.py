@@ -135,7 +135,7 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
     Return the state levels of finite samples (n,).
 
     A level is the mean of the samples in the most frequent histogram bin. Levels that are `known`
-    already are returned where the samples have nearly the same.
+    already are returned where the samples have nearly the same, with the noise of these samples.
 
     >>> levels = state_levels(np.tile([0.0, 0.1, 5.0, 5.0, 0.0, 0.0], 20))
     >>> levels.low, levels.high, levels.significant
@@ -144,7 +144,7 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
     if known and not known.steep:
         levels = _modes(samples)
         if levels.significant and levels.resembles(known):
-            return known
+            return replace(known, noise=_noise(samples))
     kept = _without_spikes(samples)
     levels = _lobes(kept) or _modes(kept)
     if not levels.steep and (passed := _passed_by_all(kept)):
@@ -160,8 +160,12 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
         kept > levels.high - near)
     return replace(levels, share=float(np.mean(kept > levels.middle)),
                    pulsed=bool(levels.steep) or bool(at_levels > _AT_LEVELS * kept.size),
-                   noise=float(np.median(np.abs(np.diff(kept, 2)))) / _SECOND,
-                   lowest=float(kept.min()), highest=float(kept.max()))
+                   noise=_noise(kept), lowest=float(kept.min()), highest=float(kept.max()))
+
+
+def _noise(samples: FloatArray) -> float:
+    """Return the standard deviation of white noise whose second differences are as large."""
+    return float(np.median(np.abs(np.diff(samples, 2)))) / _SECOND
 
 
 def _range(samples: FloatArray) -> tuple[float, float]:
