@@ -278,6 +278,18 @@ def test_what_reaches_all_channels_is_a_modulation_if_it_is_slow(rng, std, band)
         assert not found
 
 
+@pytest.mark.parametrize(('rate', 'found'), [(6000.0, True), (520.0, False), (0.0, True)])
+def test_one_order_at_the_end_of_the_band_tells_no_modulation_from_its_noise(rng, rate, found):
+    """Noise that ends beside an order changes it slowly more than fast, as a gain does."""
+    gain = 0.05 * stationary(rng, flat_band_correlation(LAGS, (0.0, 0.1)) + 1e-9 * (LAGS == 0), 12)
+    radial = gain[:, :-1, None] + rng.normal(0.0, 0.01, (12, PULSES - 1, 4))
+    evidence = evidence_of(rng, declared(rng)[:12], radial=radial)
+    finding = EFFECTS['amplitude_modulation'].fit(replace(
+        evidence, model=replace(MODEL, orders=(8.0,), sample_rate=rate), lines=replace(
+            evidence.lines, order=np.full(4, 8.0), channel=np.arange(4))))
+    assert (finding.effect is not None) == found
+
+
 def test_orders_that_a_trigger_cycle_does_not_resolve_count_as_one(rng):
     lines = evidence_of(rng, np.zeros((3, 5))).lines
     for length, groups in ((1.0, 4), (0.9, 1), (1.0 / 3.0, 1), (2.0, 4)):

@@ -24,7 +24,7 @@ from sa_jitter_ros.effects.band import (
 from sa_jitter_ros.effects.common_gain import correlations, fit_common_gain
 from sa_jitter_ros.effects.effect import (
     absent, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
-from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.evidence import Evidence, FULL_BAND
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
 
@@ -117,6 +117,10 @@ class AmplitudeModulation(DirectEffect):
         radial, noise = evidence.of_orders
         if not noise.size:
             return absent(cls.name, 'no line is compared')
+        beside = evidence.lines.order.max() + 0.5 / evidence.model.cycle_length
+        end = FULL_BAND * evidence.model.sample_rate / evidence.model.fundamental_frequency
+        if noise.size == 1 and 0.0 < end < beside:  # slow noise is larger than fast one, too
+            return absent(cls.name, 'the one order that is compared has noise that ends beside it')
         found = fit_common_gain(radial, noise)
         if not found.powers.any():
             return absent(cls.name, 'the one order that is compared scatters as noise does')

@@ -26,6 +26,9 @@ from sa_jitter_ros.prediction.influence import (
     AveragePulses, declared_jitter, Influence, mean_period)
 from sa_jitter_ros.prediction.model import DeclaredModel
 
+#: Of the sample rate: beyond it, filters may end.
+FULL_BAND = 0.4
+
 
 @dataclass(frozen=True)
 class Tone:

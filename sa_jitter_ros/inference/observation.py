@@ -31,10 +31,10 @@ from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray, FloatArray, Int
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
+from sa_jitter_ros.effects.evidence import FULL_BAND
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.clock_steps import broken_at_steps, clock_steps, ClockStep
 from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
-from sa_jitter_ros.inference.order_band import FULL_BAND
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.evidence import FULL_BAND
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.interpolate import CubicSpline
@@ -31,8 +32,6 @@ BEYOND_LINES, EDGE = 3.0, 1.15
 # The band that is read ends so far above the highest declared order, or lines of a trigger cycle:
 # what lies further away does not leak into a cycle.
 _BEYOND = 6.0
-#: Of the sample rate: beyond it, filters may end.
-FULL_BAND = 0.4
 _SAMPLES = 3.7  # in a period of the band's end
 # Trigger cycles between two speeds that an even time follows; what it leaves to the band's edge.
 _KNOTS, _STEADY = 10, 1.05
