@@ -100,7 +100,7 @@ def test_no_function_is_long(folder):
 
 
 def test_the_longest_modules_can_be_maintained():
-    longest = sorted(MODULES, key=lambda path: len(parsed(path)[0]))[-15:]
+    longest = sorted(MODULES, key=lambda path: len(parsed(path)[0]))[-40:]
     found = {path.name: mi_visit(parsed(path)[0], multi=True) for path in longest}
     assert {name: value for name, value in found.items()
             if value < BUDGETS['maintainability_index']} == {}

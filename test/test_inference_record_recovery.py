@@ -213,7 +213,7 @@ def test_a_line_in_noise_lets_no_chance_choose_the_acquisitions(rng, order):
     assert recovered == 0, f'{recovered} of {len(found.acquisitions)}'
 
 
-@pytest.mark.parametrize(('noise', 'compared'), [(0.02, True), (0.5, False)])
+@pytest.mark.parametrize(('noise', 'compared'), [(0.02, True), (0.2, True), (0.5, False)])
 def test_pulses_without_errors_are_compared_where_their_recovery_costs_no_amplitude(
         rng, noise, compared):
     time = np.arange(int(8.0 * RATE)) / RATE

@@ -334,7 +334,7 @@ def test_noise_that_grows_costs_the_pulses_of_one_window(edge, width, rng):
     rate, speed = 25.6e3, 20.0
     turn = speed * np.arange(round(8.0 * rate)) / rate % 1.0 - 0.3
     wave = 5.0 * (np.clip(turn / edge, 0.0, 1.0) - np.clip((turn - width) / edge, 0.0, 1.0))
-    wave += np.where(np.arange(turn.size) < 2.0 * rate, 0.01, 0.2) * rng.standard_normal(turn.size)
+    wave += np.where(np.arange(turn.size) < 2.0 * rate, 0.02, 0.2) * rng.standard_normal(turn.size)
     pulses, _ = detect(wave, rate=rate)
     late = pulses[pulses > 2.51]
     assert late.size == 110

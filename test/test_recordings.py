@@ -776,6 +776,17 @@ def test_csv_cells_without_a_number_are_gaps(rng, tmp_path):
         read(tmp_path / 'rig.csv').read()
 
 
+def test_csv_whose_first_row_has_a_gap_and_what_others_have_not(tmp_path):
+    rows = [[f'{k / RATE:.9g}', str(k % 7), ''] for k in range(100)]
+    rows[0][1:] = '', '20.5'
+    (tmp_path / 'rig.csv').write_text('time,a,temperature\ns,g,C\n' + '\n'.join(
+        map(','.join, rows)))
+    opened = read(tmp_path / 'rig.csv')
+    assert (opened.channel_names, opened.remarks) == (
+        ('a',), ('column temperature is empty in most rows and is left out',))
+    np.testing.assert_array_equal(opened.read()[0], [np.nan, *(k % 7 for k in range(1, 100))])
+
+
 @pytest.mark.parametrize('place', [0, 1, 2, 3, 20])
 def test_csv_with_a_bad_row_is_not_shortened(tmp_path, place):
     rows = [','.join(row) for row in ROWS]

@@ -184,10 +184,10 @@ class CsvLayout:
         return above + 1 if above >= 0 and self._is_text(above) else first
 
     def _has_gaps(self, number: int) -> bool:
-        """Return whether a row has numbers in some columns of samples and nothing in others."""
+        """Return whether a row has numbers in some columns, of samples too, and no text."""
         row = self._rows[number]
         filled = {k for k, text in enumerate(row) if text}
-        return bool(filled) and filled < self.pattern and len(row) > max(self.pattern) and (
+        return bool(filled & self.pattern) and len(row) > max(self.pattern) and (
             filled == self._values[number].keys())
 
     def _header(self, above: Sequence[int]) -> tuple[int | None, int | None]:
