@@ -233,6 +233,19 @@ def test_jitter_of_a_declared_scale_is_that_and_normal_jitter_comes_on_top(scale
 
 
 @pytest.mark.machines
+@pytest.mark.parametrize('scale', [0.4, 0.7])
+def test_standard_error_of_a_scale_is_that_of_uniform_errors(scale):
+    off = []
+    for seed in range(30):
+        timing = read_timing([machine([510, seed], scale=scale)],
+                             names=frozenset({'jitter_scale'}))
+        found, error = value_of(timing, 'jitter_scale', 'scale')
+        off.append((found - scale) / error)
+    # it is 0.63 by that of normal errors; of 30, a deviation has a standard error of 0.13
+    assert 0.72 < np.sqrt(np.mean(np.square(off))) < 1.39
+
+
+@pytest.mark.machines
 def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
     timing = read_timing([machine([0, k], count=163, excess=1.0, skew=9.5e-5) for k in range(2)])
     assert timing.choice.best == {'clock_skew', 'jitter_scale'}

@@ -323,8 +323,10 @@ def _of_jitter(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> 
     known = [item.scale for item in declared if isinstance(item, JitterScale)]
     least = known[0] if known else 1.0
     fit, setting = choice.fit, choice.setting
-    log_power, error = float(fit.starts[JITTER][0]), float(fit.standard_errors(JITTER)[0])
+    log_power, normal_error = float(fit.starts[JITTER][0]), float(fit.standard_errors(JITTER)[0])
     scale = math.exp(0.5 * log_power)
+    seen = fit.more_than_held(JITTER, chooser.shapes.kurtosis if chooser.shapes else 0.0)[1]
+    error = 1.0 / seen if seen > 0.0 else normal_error
     p_value = _p_value(choice, JITTER, chooser)
     same = math.sqrt(setting.model.distribution.variance)
     text = (f'independent pulse errors of {measured_text(scale * same, None, "s")}, '
@@ -341,7 +343,7 @@ def _of_jitter(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> 
                        deciding_measurement=JitterScale.deciding_measurement if rivals else '')
     share = max(1.0 - (least / scale) ** 2, 1e-9)  # of all power
     effect, errors = EFFECTS[EXCESS].of_timing(
-        np.array([log_power + math.log(share)]), np.array([error / share]), setting)
+        np.array([log_power + math.log(share)]), np.array([normal_error / share]), setting)
     if odds > -DECIDED:
         rivals = (JITTER, *rivals)
     return Finding(EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,

@@ -247,7 +247,7 @@ class TimingFit:
 
     def more_than_held(self, name: str, kurtosis: float) -> tuple[float, float]:
         """
-        Return how much more power than a held one the data show, and how much it is more than 0.
+        Return how much more power than this one the data show, and how much it is more than 0.
 
         Both are in standard errors of the efficient score (Rao 1948): the slope of the likelihood
         by the logarithm of the power, less what the free parameters make of it. `kurtosis` is that
@@ -255,8 +255,9 @@ class TimingFit:
         are 0 where the data show nothing of it.
         """
         at, size = self.parameters, self.data.size
-        chosen = np.append(self.place[name].start,
-                           np.flatnonzero((self.lower < at) & (at < self.upper)))
+        own = self.place[name].start
+        chosen = np.append(own, np.setdiff1d(
+            np.flatnonzero((self.lower < at) & (at < self.upper)), own))
         change = self._changes[chosen]
         known = self._information[np.ix_(chosen, chosen)]
         known[1:, 1:] += np.diag(12.0 / (self.upper - self.lower)[chosen[1:]] ** 2)
