@@ -51,7 +51,7 @@ CORE = {
         'samples'},
     'simulation': SCIENCE | {'errors'},
     'tacholess': SCIENCE | {
-        'averaging', 'errors', 'machine', 'parameters', 'recordings'},
+        'averaging', 'errors', 'machine', 'parameters', 'pulses', 'recordings'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
         'samples'},

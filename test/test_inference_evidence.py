@@ -89,7 +89,7 @@ ORDER = 100.0 * FREQUENCY
 
 def interpolator(radial):
     """Return the interpolator whose beat is certain, '' for none."""
-    return find_beat(radial, ORDER, FREQUENCY).method
+    return find_beat(radial, np.arange(len(radial)), ORDER, FREQUENCY).method
 
 
 def test_beat_is_found_among_other_changes_of_the_lines(rng):
@@ -101,7 +101,8 @@ def test_beat_is_found_among_other_changes_of_the_lines(rng):
     assert interpolator(others + noise) == ''
     assert interpolator(beat + others + noise) == 'linear'
     radial = beat + others + noise
-    beating = radial - without_beat(radial, find_beat(radial, ORDER, FREQUENCY))
+    times = cycle[:, 0] / 25.0
+    beating = radial - without_beat(radial, times, find_beat(radial, times, ORDER, FREQUENCY))
     wave = np.exp(-2j * np.pi * 0.0873 * cycle)
     assert np.abs((beating * wave).mean(axis=0)) == pytest.approx(
         np.abs((beat * wave).mean(axis=0)), rel=0.05, abs=1e-3)
@@ -119,6 +120,22 @@ def test_lines_that_beat_otherwise_were_not_interpolated(rng):
     assert method(beat[:, ::-1]) == ''  # not as the frequencies
     delay = np.array([0, 4, 7, 2])  # out of step
     assert method(np.stack([np.roll(row, n) for row, n in zip(beat.T, delay)], axis=1)) == ''
+
+
+@pytest.mark.parametrize('turns', [0.2, 0.97, 1.0, 3.3, 4.6])
+def test_a_beat_of_any_rate_is_found_while_the_speed_changes(rng, turns):
+    parts = 16
+    speed = 25.0 * (1.0 + 0.2 * np.sin(np.linspace(0.0, 2.0, 300 * parts)))  # cycles a second
+    times = np.cumsum(1.0 / (parts * speed))
+    radial = beats(FREQUENCY, (turns * 25.0 * times[:, None]) % 1.0)
+    noise = rng.normal(0.0, 0.05, radial.shape)
+    found = find_beat(radial + noise, times, ORDER, FREQUENCY)
+    assert (found.method, found.frequency) == ('linear', pytest.approx(turns * 25.0, abs=0.05))
+    assert find_beat(noise, times, ORDER, FREQUENCY).method == ''
+    assert find_beat(2.0 * radial + noise, times, ORDER, FREQUENCY).method == ''
+    some = radial[::parts] if turns < 0.5 else noise[::parts]
+    left = without_beat(some, times[::parts], found)
+    assert left.std() == pytest.approx(some.std() if turns > 0.5 else 0.0, rel=0.1, abs=0.01)
 
 
 def test_a_sideband_of_one_order_is_no_beat(rng):

@@ -79,7 +79,7 @@ def observed(model, count=1):
     nothing = np.zeros((3, 3))
     cycles = np.tile(np.eye(3, dtype=complex), (2, 1, 1))
     item = Acquisition(0, times, missing, times, 0.0 * times, 0.0 * times, cycles, cycles, nothing,
-                       nothing, 0.0 * missing, 0.0, True, '')
+                       nothing, np.zeros((0, 3, 3)), 0.0 * missing, 0.0, True, '')
     orders = np.array(model.orders)
     return Observation(model, count * (item,), orders, orders, ('a', 'b', 'c'),
                        RecordPulses.unbroken(times), model.sample_rate, False, model.trigger_speed)

@@ -253,7 +253,8 @@ def test_beat_tells_the_gain_of_the_interpolator(rng, method):
         -2j * np.pi * np.outer(at, frequency)))
     mean = gain.mean(axis=0)
     found = find_beat(
-        gain / mean - 1.0 + rng.normal(0.0, 2e-4, gain.shape), 100.0 * frequency, frequency)
+        gain / mean - 1.0 + rng.normal(0.0, 2e-4, gain.shape), np.arange(240), 100.0 * frequency,
+        frequency)
     assert found.method == method
     assert found.kept == pytest.approx(mean, abs=0.06 * (1.0 - mean.min()) + 1e-3)
 
@@ -262,7 +263,7 @@ def test_modulation_of_all_lines_alike_is_no_beat(rng):
     radial = 0.05 * np.cos(0.7 * np.arange(240))[:, None] + rng.normal(0.0, 1e-3, (240, 4))
     frequency = np.array([0.08, 0.16, 0.24, 0.32])
     for some in (radial, radial[:8]):
-        assert find_beat(some, 100.0 * frequency, frequency).method == ''
+        assert find_beat(some, np.arange(len(some)), 100.0 * frequency, frequency).method == ''
 
 
 @pytest.mark.machines

@@ -23,13 +23,11 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.spectral_lines import line_limit, peaks, spectrum
-from sa_jitter_ros.pulses.resampling import interpolate
+from sa_jitter_ros.pulses.resampling import FULL_BAND, interpolate
 from scipy.fft import rfft
 
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32
-# The part of the sampling rate in which lines and orders are searched.
-BAND = 0.4
 # A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
 # of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
 # Lengths of panels are this factor apart, so that fits up to similar orders share them.
@@ -102,7 +100,7 @@ class GridCycles:
         rate, with their power (line,) over the noise around.
         """
         count, points, channels = self.cycles.shape
-        most = 2 ** int(np.log2(max(BAND * points / top, 1.0)))  # the same for similar shafts
+        most = 2 ** int(np.log2(max(FULL_BAND * points / top, 1.0)))  # the same for similar shafts
         together = max(number for number in range(1, most + 1) if points % number == 0)
         if together not in self._means:
             means = self.cycles.reshape(count, -1, together, channels).mean(axis=2)
@@ -116,7 +114,7 @@ class GridCycles:
                           (knots + errors[ends]).ravel(), knots.ravel())
         flat = interpolate(flat, np.minimum(place * (len(flat) / self.span), len(flat) - 1.0))
         ratio, _ = spectrum(flat, turns, self.size)
-        ratio = ratio[:int(BAND * len(flat))]
+        ratio = ratio[:int(FULL_BAND * len(flat))]
         bins, tops = peaks(ratio, line_limit(channels, len(ratio)))
         return tops / self.span, ratio[bins]
 

@@ -27,9 +27,10 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import ComplexArray, FloatArray, IntArray
-from sa_jitter_ros.averaging.grid_cycles import BAND, cycle_weights, GridCycles
+from sa_jitter_ros.averaging.grid_cycles import cycle_weights, GridCycles
 from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import CompressedCycles
+from sa_jitter_ros.pulses.resampling import FULL_BAND
 from scipy.ndimage import median_filter
 
 # Probability that noise alone passes as a synchronous order in any of the orders and channels.
@@ -70,7 +71,7 @@ class LineSearch:
 
         `additional_orders` are searched besides the integer ones.
         """
-        top = BAND * grid.cycles.shape[1] / cycle_length
+        top = FULL_BAND * grid.cycles.shape[1] / cycle_length
         others = [g for g in additional_orders if 0.0 < g <= top]
         orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
         used = slice(grid.first, grid.first + grid.spectra.shape[1])

@@ -24,9 +24,10 @@ from sa_jitter_ros.effects.band import (
 from sa_jitter_ros.effects.common_gain import correlations, fit_common_gain
 from sa_jitter_ros.effects.effect import (
     absent, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
-from sa_jitter_ros.effects.evidence import Evidence, FULL_BAND
+from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.pulses.resampling import FULL_BAND
 
 
 @dataclass(frozen=True)

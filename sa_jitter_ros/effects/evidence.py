@@ -26,9 +26,6 @@ from sa_jitter_ros.prediction.influence import (
     AveragePulses, declared_jitter, Influence, mean_period)
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-#: Of the sample rate: beyond it, filters may end.
-FULL_BAND = 0.4
-
 
 @dataclass(frozen=True)
 class Tone:
@@ -55,7 +52,7 @@ class Beat:
 
     `gain` is what it adds to the logarithm of the evidence, `p_value` the chance of as much
     without one. `method` is the interpolator, '' unless the beat is certain, and `kept` (line,)
-    the share of the amplitude that it leaves; `frequency` is in cycles a trigger cycle.
+    the share of the amplitude that it leaves; `frequency` is in Hz.
     """
 
     gain: float = 0.0

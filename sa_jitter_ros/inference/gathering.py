@@ -277,13 +277,16 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     floor = lines.of(observation.stacked('noise_floor'))
     density = floor * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
     order = observation.orders[lines.order]
-    beating = cycles + lines.of(_sidebands(observation, shortest))
-    steady = np.abs(beating) / level  # what turns a line is no beat
-    beat = find_beat(steady.reshape(-1, order.size), order,
-                     order * model.fundamental_frequency / observation.sample_rate)
+    items = observation.acquisitions
+    steady = lines.of(np.concatenate([item.parts for item in items]))  # what turns it is no beat
+    beat = find_beat(
+        steady / level, np.concatenate([item.middles(len(item.parts)) for item in items]), order,
+        order * model.fundamental_frequency / observation.sample_rate)
+    times = np.array([item.middles(len(item.cycles))[:shortest] for item in items])
     return LineEvidence(
         order=order, channel=lines.channel, level=level, noise_density=density,
-        radial=without_beat(along.reshape(-1, order.size), beat).reshape(along.shape),
+        radial=without_beat(along.reshape(-1, order.size), times.ravel(), beat
+                            ).reshape(along.shape),
         radial_noise=noise * np.sqrt(shortest) / level, tone=tone,
         hidden_tone=_hidden_tone(observation, density), beat=beat)
 
@@ -292,30 +295,13 @@ def _beside(observation: Observation, lines: Lines, tone: Tone, relative: Array)
     """Return what of `relative` amplitudes (acquisition, cycle, line), less 1, a tone makes."""
     order = observation.orders[lines.order]
     places = np.arange(relative.shape[1]) + 0.5  # middles of cycles
-    times = np.array([np.interp(places, item.number, item.true_times)
+    times = np.array([item.middles(len(item.cycles))[:places.size]
                       for item in observation.acquisitions])
     angle = observation.model.cycle_length * np.array(
         [observation.pulses.number[item.first] + places for item in observation.acquisitions])
     turns = tone.frequency * times[..., None] - angle[..., None] * order
     wave = np.exp(2j * np.pi * turns)
     return np.asarray(np.mean(relative * wave.conj(), axis=(0, 1)) * wave)
-
-
-def _sidebands(observation: Observation, count: int) -> Array:
-    """
-    Return what undeclared sources make of the orders (acquisition, cycle, channel, order).
-
-    It was taken out of the amplitudes with the leakage, but the beat of an interpolator makes such
-    sources, too: those beside an order by less than half the trigger rate.
-    """
-    declared = observation.orders.size
-    turns = observation.model.cycle_length * (
-        observation.sources[declared:, None] - observation.orders)
-    share = np.exp(1j * np.pi * turns) * np.sinc(turns) * (np.abs(turns) < 0.5)
-    mean = np.array([item.cycles[..., declared:].mean(axis=0)
-                     for item in observation.acquisitions])
-    waves = np.exp(2j * np.pi * turns * np.arange(count)[:, None, None]) * share
-    return np.asarray(np.einsum('acs,kso->akco', mean, waves))
 
 
 def _tone(observation: Observation, lines: Lines) -> Tone | None:

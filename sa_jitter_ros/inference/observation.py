@@ -31,7 +31,6 @@ from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray, FloatArray, Int
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
-from sa_jitter_ros.effects.evidence import FULL_BAND
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.clock_steps import broken_at_steps, clock_steps, ClockStep
 from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
@@ -42,6 +41,7 @@ from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.prediction.influence import common_turn, mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
+from sa_jitter_ros.pulses.resampling import FULL_BAND
 from sa_jitter_ros.recordings.channel_check import stuck
 from sa_jitter_ros.recordings.limits import MAX_VALUES
 from sa_jitter_ros.recordings.recording import Recording
@@ -54,6 +54,7 @@ CHANCE = 4
 #: Of the strongest channel's amplitude of an order, from which on a line is worth comparing.
 STRONG = 0.2
 _OTHER_MACHINE = 5.0
+_PARTS = 16  # of a trigger cycle, in which the beat of an interpolator is looked for
 _HARMLESS = 3e-4  # of an amplitude, a tenth of what residuals are to be accurate to
 _LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
 
@@ -74,9 +75,11 @@ class Acquisition:
     interpolated. `raw` and `corrected` (channel, order) are complex peak amplitudes; `raw_cycles`
     and `cycles` (cycle, channel, order) those of single cycles. `noise` (channel, order) is the
     standard deviation of an amplitude along its radius, `noise_floor` the part of it that the
-    spectrum around the order shows. `ripple` (cycle,) is the factor of u (1 - u) in the error
-    inside a cycle (s). Unless the errors are `recovered`, because their standard errors are as
-    large as they are, the corrected amplitudes are the raw ones, and `reason` says why.
+    spectrum around the order shows. `parts` (part, channel, order) are the amplitudes of declared
+    orders in equal parts of the cycles, less the other ones. `ripple` (cycle,) is the factor of
+    u (1 - u) in the error inside a cycle (s). Unless the errors are `recovered`, because their
+    standard errors are as large as they are, the corrected amplitudes are the raw ones, and
+    `reason` says why.
     """
 
     first: int
@@ -89,6 +92,7 @@ class Acquisition:
     cycles: ComplexArray
     noise: FloatArray
     noise_floor: FloatArray
+    parts: FloatArray
     ripple: FloatArray
     ripple_standard_error: float
     recovered: bool
@@ -103,6 +107,11 @@ class Acquisition:
     def true_times(self) -> FloatArray:
         """Return the times of the measured pulses less their recovered errors, in s."""
         return self.times - np.nan_to_num(self.errors)
+
+    def middles(self, count: int) -> FloatArray:
+        """Return the middles of so many equal parts of its cycles, in s."""
+        places = (np.arange(count) + 0.5) * len(self.cycles) / max(count, 1)
+        return np.asarray(np.interp(places, self.number, self.true_times))
 
     @property
     def period(self) -> float:
@@ -397,14 +406,31 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
     clean_cycles = _clean(reader.amplitudes(cycles, model, sources, corrected_law), model, sources)
-    floor = noise_floor(cycle_grid([cycles], method=reader.method, law=corrected_law,
-                                   period=float(np.diff(bridged).max())),
-                        model.cycle_length, sources[:len(model.orders)],
+    grid = cycle_grid([cycles], method=reader.method, law=corrected_law,
+                      period=float(np.diff(bridged).max()))
+    declared = sources[:len(model.orders)]
+    floor = noise_floor(grid, model.cycle_length, declared,
                         FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
         first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
-        radial_noise(clean_cycles), floor, ripple, recovery.ripple_standard_error, not reason,
-        reason)
+        radial_noise(clean_cycles), floor, _in_parts(
+            grid, clean_cycles[..., :len(declared)], model.cycle_length * declared),
+        ripple, recovery.ripple_standard_error, not reason, reason)
+
+
+def _in_parts(grid: FloatArray, cycles: ComplexArray, turns: FloatArray) -> FloatArray:
+    """Return the amplitudes in parts of the cycles of a grid, of one of the `turns` at a time."""
+    points = grid.shape[1]
+    count = min(_PARTS, points)
+    begins = np.arange(count) * points // count
+    waves = np.exp(2j * np.pi * np.arange(points)[:, None] / points * turns)
+    own = cycles * np.exp(2j * np.pi * np.arange(len(cycles))[:, None, None] * turns)
+    rest = grid - (own @ waves.T).real.transpose(0, 2, 1)
+    left = [np.add.reduceat(rest * (2.0 * wave.conj())[:, None], begins, axis=1)
+            for wave in waves.T]
+    means = np.stack(left, axis=-1) / np.diff([*begins, points])[:, None, None]
+    unit = np.exp(-1j * np.angle(own))[:, None]
+    return np.asarray(((own[:, None] + means) * unit).real).reshape(-1, *cycles.shape[1:])
 
 
 def _clean(cycles: ComplexArray, model: DeclaredModel, sources: FloatArray) -> ComplexArray:

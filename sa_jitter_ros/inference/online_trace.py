@@ -130,6 +130,7 @@ def _observation(averages: Sequence[ReceivedAverage], model: DeclaredModel) -> O
             bridged=when, errors=errors - errors.mean(), standard_errors=error,
             raw_cycles=item.raw[None][:, :, kept], cycles=item.corrected[None][:, :, kept],
             noise=item.noise[:, kept], noise_floor=item.noise[:, kept],
+            parts=np.zeros((0, *item.noise[:, kept].shape)),
             ripple=np.full(count, np.nan), ripple_standard_error=math.inf, recovered=True,
             reason=''))
     speed = float(np.mean([item.trigger_speed for item in averages]))

@@ -21,8 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.effects.evidence import FULL_BAND
-from sa_jitter_ros.pulses.resampling import interpolate
+from sa_jitter_ros.pulses.resampling import FULL_BAND, interpolate
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.interpolate import CubicSpline
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
-from sa_jitter_ros.pulses.resampling import interpolate
+from sa_jitter_ros.pulses.resampling import FULL_BAND, interpolate
 from scipy.fft import next_fast_len, rfft
 from scipy.special import softmax
 
@@ -131,7 +131,7 @@ def _spectrum(samples: FloatArray, places: FloatArray, turned: FloatArray) -> Fl
     over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
     over_angle -= over_angle.mean(axis=0)
     window = np.hanning(points + 1)[:-1, None]
-    return np.asarray(np.abs(rfft(over_angle * window, axis=0))[:int(0.42 * points)])
+    return np.asarray(np.abs(rfft(over_angle * window, axis=0))[:int(FULL_BAND * points)])
 
 
 def _background(spectrum: FloatArray) -> FloatArray:

@@ -33,6 +33,8 @@ from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.inner_loops import room, weighted_sums
 from scipy.special import i0
 
+#: Of the sampling rate: lines are looked for below it, filters may end beyond it.
+FULL_BAND = 0.4
 _Places = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
 
 _SPLINE_POLE = np.sqrt(3.0) - 2.0

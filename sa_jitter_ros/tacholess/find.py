@@ -18,12 +18,12 @@ from sa_jitter_ros.arrays import BoolArray, FloatArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.parameters import number, numbers
+from sa_jitter_ros.pulses.resampling import FULL_BAND
 from sa_jitter_ros.tacholess.found import among, FoundPulses
 from sa_jitter_ros.tacholess.phase import Phase, phase_of, UNKNOWN
 from sa_jitter_ros.tacholess.rough import PRESENT, Rough, rough_speed
 
 _MOST_ORDERS = 8  # of which the phase is looked at
-_BAND = 0.45  # of the sampling rate, up to which lines are used
 _MOST_CELLS = 20_000
 _FEWEST_CELLS = 16
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
@@ -76,7 +76,7 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     samples, start = samples[:, begin:end], start + begin / rate
     rough = rough_speed(samples, rate, wanted, (low, high), maximum_rate)
     kept = ~among(wanted, [*hold_out]) & (rough.evidence > PRESENT) & (
-        wanted * rough.speed.max() < _BAND * rate)
+        wanted * rough.speed.max() < FULL_BAND * rate)
     strongest = np.argsort(-rough.evidence * kept)[:_MOST_ORDERS]
     used = np.sort(wanted[strongest[kept[strongest]]])
     if not used.size:
@@ -137,11 +137,11 @@ def _range(speed_range: Sequence[float], rate: float, orders: FloatArray) -> tup
     if len(found) != 2 or not np.all(np.isfinite(found)) or not 0.0 < found[0] < found[1]:
         raise ParameterError(f'speed_range is {[*found]}: give (lowest, highest) speed in Hz, '
                              'both above 0, the lowest first')
-    if orders[0] * found[1] > _BAND * rate:
+    if orders[0] * found[1] > FULL_BAND * rate:
         raise ParameterError(
             f'speed_range goes to {found[1]:g} Hz, where the lowest order {orders[0]:g} is at '
             f'{orders[0] * found[1]:g} Hz: a sample_rate of {rate:g} Hz shows up to '
-            f'{_BAND * rate:g} Hz')
+            f'{FULL_BAND * rate:g} Hz')
     return float(found[0]), float(found[1])
 
 
