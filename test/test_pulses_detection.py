@@ -497,3 +497,74 @@ def test_spikes_in_every_window_cost_no_pulse(speed, every, length, rng):
     found = np.append(detector.update(spoilt, 0.0, 5e3), detector.flush())
     assert np.abs(found - sa.detect_pulses(clean, 5e3)).max() < 2e-4
     assert detector.state.spikes == length * places.size
+
+
+def in_bits(wave, rng, *, noise=0.25, volts=20.0 / 4096):
+    """Return a waveform in V from a converter of 12 bits, with noise in units of the last one."""
+    return np.round(wave / volts + noise * rng.standard_normal(wave.size)) * volts
+
+
+@pytest.mark.parametrize(('speed', 'rate', 'turning', 'stopped'), [
+    (25.0, 10_000.0, 4.0, 3.0), (25.0, 10_000.0, 0.0, 4.5), (0.2, 5000.0, 60.0, 0.0),
+    (1.0, 5000.0, 20.0, 3.0)])
+def test_the_last_bit_of_a_machine_that_stands_is_no_pulse(speed, rate, turning, stopped, rng):
+    t = np.arange(round((2.0 * turning + stopped + 4.0) * rate)) / rate
+    turns = 0.37 + speed * (np.minimum(t, turning) + np.clip(t - turning - stopped, 0.0, None))
+    wave = np.where(turns % 1.0 < 0.1, 5.0, 0.0)
+    expected = t[1:][np.diff(np.floor(turns)) > 0]
+    for noise in (0.0, 0.25, 0.5):
+        found = detect(in_bits(wave, rng, noise=noise), rate=rate)[0]
+        assert found == pytest.approx(expected, abs=1.5 / rate)
+    still = in_bits(0.0 * wave, rng, noise=0.25)
+    assert detect(still, rate=rate)[0].size == 0
+
+
+@pytest.mark.parametrize('level', [1.0, 5.0])
+@pytest.mark.parametrize(('speed', 'width'), [(25.0, 1), (5.0, 3), (2.0, 3), (5.0, 1)])
+def test_pulses_of_a_digital_input_may_be_short(level, speed, width):
+    """Of one sample and fewer than six in a window they are those of the levels 0 and 1."""
+    wave = level * (np.arange(10_000) % round(1000.0 / speed) < width)
+    found = detect(wave, rate=1000.0)[0].size
+    assert found == (0 if level > 1.0 and speed == 5.0 and width == 1 else
+                     np.count_nonzero(np.diff(wave) > 0.0))
+
+
+def test_a_cable_that_is_unplugged_gives_no_pulses(rng):
+    t = np.arange(100_000) / 1e4
+    wave = np.where(25.0 * t % 1.0 < 0.1, 5.0, 0.0)
+    for off in rng.uniform(2.0, 6.0, 10):
+        quiet = (t >= off) & (t < off + 2.0)
+        read = in_bits(np.where(quiet, 0.0, wave), rng, noise=np.where(quiet, 0.0, 10.0))
+        found = detect(read, rate=1e4)[0]
+        assert found.size == pytest.approx(200, abs=1)
+        assert not np.any((found > off + 1e-3) & (found < off + 2.0 - 1e-3))
+
+
+def reluctance_wheel(rng, *, teeth, missing, tooth, speeds, noise=1e-3, rate=20_000.0,
+                     seconds=8.0):
+    """Return the voltage of a wheel at a speed that changes, true times and pitch (s)."""
+    t = np.arange(round(seconds * rate)) / rate
+    rise = (speeds[1] - speeds[0]) / seconds
+    place = teeth * (0.37 + speeds[0] * t + 0.5 * rise * t**2)
+    voltage = np.zeros(t.size)
+    for near in np.floor(place) + np.arange(-1.0, 3.0)[:, None]:
+        apart = (place - near) / tooth
+        voltage -= np.where(near % teeth < teeth - missing, apart * np.exp(-0.5 * apart**2), 0.0)
+    voltage = voltage * (speeds[0] + rise * t) + noise * max(speeds) * rng.standard_normal(t.size)
+    whole = np.arange(np.ceil(place[0]), place[-1])
+    return voltage, np.interp(whole[whole % teeth < teeth - missing], place, t)
+
+
+@pytest.mark.parametrize('gain', [1.0, -2.0])
+@pytest.mark.parametrize(('teeth', 'missing', 'tooth', 'speeds'), [
+    (60, 2, 0.2, (10.0, 40.0)), (60, 2, 0.3, (20.0, 20.0)), (36, 1, 0.25, (15.0, 5.0)),
+    (60, 2, 0.2, (3.0, 3.0)), (4, 1, 0.15, (10.0, 20.0))])
+def test_reluctance_of_a_wheel_with_missing_teeth_has_the_time_of_each_tooth(
+        rng, gain, teeth, missing, tooth, speeds):
+    """All around the wheel, also beside the gap, where the voltage rests at the threshold."""
+    voltage, times = reluctance_wheel(
+        rng, teeth=teeth, missing=missing, tooth=tooth, speeds=speeds)
+    pulses = detect(2.5 + gain * voltage, rate=20_000.0)[0]
+    near = np.abs(pulses - times[np.searchsorted(0.5 * (times[1:] + times[:-1]), pulses)])
+    assert pulses.size == pytest.approx(times.size, abs=2)
+    assert np.quantile(near, 0.999) < 0.01 / (teeth * min(speeds))

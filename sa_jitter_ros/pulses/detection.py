@@ -46,6 +46,7 @@ _DRIFTED = 0.5
 # Half of the hysteresis: at least so many standard deviations of the noise, by which a slow edge
 # crosses the threshold several times, but at most this fraction of the level difference.
 _BEYOND_NOISE, _WIDEST = 4.0, 0.2
+_FEWEST = 40  # samples from which levels are learnt: ten intervals of four
 _LOUDER = 1.5  # change of the noise that is another one
 # Part of a lobe that a signal must pass on either side of the resting level.
 _PASSED = 0.4
@@ -94,7 +95,7 @@ class KeyphasorDetector:
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
     :param hysteresis: width of the band around the threshold, a fraction of the level difference;
-        unless 0 it is widened to 8 standard deviations of the noise, up to half the difference.
+        unless 0 it is widened to 8 standard deviations of the noise, up to 0.4 of the difference.
     :param polarity: 'negative' for pulses below the resting level; their first edge is 'rising'.
         'auto': decided from the first levels; the state in which the signal is less often is the
         pulse, the upper one where they are about equal.
@@ -177,7 +178,8 @@ class KeyphasorDetector:
             self._origin, self._index = start_time, 0
         self._samples += block.size
         found = []
-        window = max(round(self._learning_time * sample_rate), 8) if self._learns else block.size
+        window = block.size if not self._learns else max(
+            round(self._learning_time * sample_rate), _FEWEST)
         while block.size:
             piece, block = np.split(block, [window - sum(part.size for *_, part in self._window)])
             part = self._origin, self._index, self._sign * piece
@@ -239,6 +241,8 @@ class KeyphasorDetector:
             self._pending, self._confirmed = None, True
             if not levels.resembles(known):
                 self._levels = levels
+            elif known.steep:  # lobes grow with the speed, and the threshold stays between them
+                self._levels = replace(levels, resting=known.resting)
             elif max(levels.noise, known.noise) > _LOUDER * min(levels.noise, known.noise):
                 self._levels = replace(known, noise=levels.noise)
         elif not self._confirmed or self._idle(window, known) or (
@@ -363,9 +367,9 @@ def spikes_text(count: int) -> str:
     """Return what users should know of so many spikes, '' for none."""
     if not count:
         return ''
-    which = ('1 sample of the keyphasor waveform is a spike' if count == 1 else
-             f'{count} samples of the keyphasor waveform are spikes')
-    return (f'{which}, far beyond its levels, and was bridged: look at cable and ground of the '
+    which, were = ('1 sample of the keyphasor waveform is a spike', 'was') if count == 1 else (
+        f'{count} samples of the keyphasor waveform are spikes', 'were')
+    return (f'{which}, far beyond its levels, and {were} bridged: look at cable and ground of the '
             'sensor')
 
 

@@ -52,8 +52,13 @@ _CENTRAL = 0.25  # part of them, by which the middle of the modes may be beside 
 # and how near that is; the part of a lobe that counts; and the time from one lobe to the next in
 # widths of a lobe, beyond which they are pulses of their own.
 _LOBES, _RESTS, _NEAR, _LOBE, _JOINED = 0.25, 0.4, 0.15, 0.5, 2.0
+_GAPS = 2.0  # the pause where teeth are missing over others, and that between lobes of one
 # A waveform that is so often near one of its levels is no hum: a sine is in 41 % of its samples.
 _AT_LEVELS, _CLOSE = 0.6, 0.1
+# Runs of samples in the rarer state that may be of noise: their mean length, and samples beside
+# the first ones of all; and their length where levels are so few steps of the samples apart that
+# they may be a converter's last bit.
+_SINGLE, _MORE, _LONG, _STEPS = 1.9, 8, 2.5, 2.5
 # Samples of an edge that are kept at most, and how often a line is fitted to those in the band.
 _LONGEST, _ROUNDS = 1 << 16, 3
 _SECOND = 0.6745 * math.sqrt(6.0)  # median of second differences of white noise of size 1
@@ -68,9 +73,9 @@ class StateLevels:
     `significant` is True where samples change between two levels, False for a constant or white
     noise. Pulses with lobes on both sides of a `resting` level (else NaN) cross it between the
     lobes, the `steep` way: 'rising' or 'falling', '' for pulses with one lobe. `share` is that of
-    the samples above the middle, `pulsed` tells that most samples are near one of the levels,
-    `noise` is the standard deviation of white noise whose second differences are as large.
-    All samples that are no spikes are from `lowest` to `highest`.
+    the samples above the middle, `pulsed` tells that most samples are near one of the levels, and
+    that they change as pulses do, `noise` is the standard deviation of white noise whose second
+    differences are as large. All samples that are no spikes are from `lowest` to `highest`.
     """
 
     low: float
@@ -155,12 +160,41 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
             levels = passed
     if not levels.significant:
         return levels
+    share = float(np.mean(kept > levels.middle))
+    coarse = _in_last_bits(levels, kept)
+    as_pulses = _changes_as_pulses(levels, kept, coarse=coarse)
+    if coarse and not as_pulses:
+        return replace(levels, significant=False)
     near = _CLOSE * levels.difference
     at_levels = np.count_nonzero(kept < levels.low + near) + np.count_nonzero(
         kept > levels.high - near)
-    return replace(levels, share=float(np.mean(kept > levels.middle)),
-                   pulsed=bool(levels.steep) or bool(at_levels > _AT_LEVELS * kept.size),
-                   noise=_noise(kept), lowest=float(kept.min()), highest=float(kept.max()))
+    pulsed = as_pulses and bool(levels.steep or at_levels > _AT_LEVELS * kept.size)
+    return replace(levels, share=share, pulsed=pulsed, noise=_noise(kept),
+                   lowest=float(kept.min()), highest=float(kept.max()))
+
+
+def _in_last_bits(levels: StateLevels, samples: FloatArray) -> bool:
+    """Return whether levels are as near as those between which the last bit of samples changes."""
+    if (levels.low, levels.high) == (0.0, 1.0):  # of a digital input
+        return False
+    steps = np.abs(np.diff(samples))
+    least = float(np.min(steps, where=steps > 0.0, initial=math.inf))
+    return (levels.lobe if levels.steep else levels.difference) < _STEPS * least
+
+
+def _changes_as_pulses(levels: StateLevels, samples: FloatArray, *, coarse: bool) -> bool:
+    """
+    Return whether samples pass from level to level as pulses do, and not as noise.
+
+    Rare single samples stand as far above white noise as pulses do, but alone.
+    """
+    above = samples > (0.5 * (levels.middle + levels.high) if levels.steep else levels.middle)
+    begin, end = _runs(above if 2 * np.count_nonzero(above) < above.size else ~above)
+    if _regular(begin, 0.5 * _EVEN if coarse else _EVEN):
+        return True
+    length = end - begin
+    return bool(np.mean(length) > (_LONG if coarse else _SINGLE)
+                and (coarse or np.sum(length - 1) >= _MORE))
 
 
 def _noise(samples: FloatArray) -> float:
@@ -212,10 +246,10 @@ def _held(samples: FloatArray, level: float) -> BoolArray:
     return np.asarray(above[np.maximum.accumulate(decided)])
 
 
-def _regular(begin: npt.NDArray[np.intp]) -> bool:
+def _regular(begin: npt.NDArray[np.intp], even: float = _EVEN) -> bool:
     """Return whether runs `begin` at even intervals, as those of noise do not."""
     intervals = np.diff(begin)
-    return bool(intervals.size >= _INTERVALS and intervals.std() < _EVEN * intervals.mean())
+    return bool(intervals.size >= _INTERVALS and intervals.std() < even * intervals.mean())
 
 
 def _without_spikes(samples: FloatArray) -> FloatArray:
@@ -287,27 +321,35 @@ def _lobes(samples: FloatArray) -> StateLevels | None:
         return None
     resting = float(np.median(samples))
     up, down = high - resting, resting - low
-    if min(up, down) < _LOBES * max(up, down) or np.mean(
-            np.abs(samples - resting) < _NEAR * min(up, down)) < _RESTS:
+    if min(up, down) < _LOBES * max(up, down):
         return None
+    rests = np.mean(np.abs(samples - resting) < _NEAR * min(up, down)) >= _RESTS
     first, first_end = _runs(_held(samples - resting, _LOBE * up))
     second, second_end = _runs(_held(resting - samples, _LOBE * down))
     if first.size < 2 or abs(first.size - second.size) > 1:
         return None
     width = float(np.median(np.concatenate((first_end - first, second_end - second))))
-    pause = {'falling': _pause(first_end, second), 'rising': _pause(second_end, first)}
-    steep = min(pause, key=lambda way: pause[way])
-    if pause[steep] <= _JOINED * width + 1.0:
+    pauses = {'falling': _pauses(first_end, second), 'rising': _pauses(second_end, first)}
+    longest = {way: float(item.max()) if item.size else math.inf for way, item in pauses.items()}
+    steep, other = sorted(longest, key=lambda way: longest[way])
+    if math.isinf(longest[steep]):
+        return None
+    # teeth all around a wheel leave a rest only where some are missing, and beside all of them
+    usual = max(longest[steep] + 1.0, float(np.median(pauses[other]))) if (
+        pauses[other].size) else math.inf
+    gap = longest[other] > _GAPS * usual
+    if longest[steep] <= _JOINED * width + 1.0 and (rests or gap):
         return StateLevels(low, high, significant=True, resting=resting, steep=steep)
     # Lobes apart from each other: those above are the pulses.
-    return StateLevels(resting, high, significant=True) if _regular(first) else None
+    apart = rests and _regular(first)
+    return StateLevels(resting, high, significant=True) if apart else None
 
 
-def _pause(end: npt.NDArray[np.intp], begin: npt.NDArray[np.intp]) -> float:
-    """Return the largest number of samples from the `end` of a lobe to the next `begin`."""
+def _pauses(end: npt.NDArray[np.intp], begin: npt.NDArray[np.intp]) -> FloatArray:
+    """Return the numbers of samples from the `end` of a lobe to the next `begin` (pause,)."""
     place = np.searchsorted(begin, end)
     known = place < begin.size
-    return float(np.max(begin[place[known]] - end[known])) if known.any() else math.inf
+    return np.asarray(begin[place[known]] - end[known], np.float64)
 
 
 class SchmittTrigger:
