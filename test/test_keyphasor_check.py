@@ -571,3 +571,17 @@ def test_what_marks_do_not_show_of_the_speed_is_given_in_per_cent():
     found, = _of_speed(None, 1.0, [1.0, 2.0], (np.array([0.1, 0.2]), np.array([0.01, 0.013])))
     assert 'no order here then loses more than 1.3 %' in found.text
     assert dict(found.cost) == {1.0: 10.0, 2.0: 20.0}
+
+
+@pytest.mark.parametrize(('from_rest', 'marks'), [(True, 1), (False, 1), (None, 2), (None, 3)])
+def test_pulses_before_and_behind_those_whose_speed_is_known_are_not_spurious(
+        rng, from_rest, marks):
+    t = np.arange(round(20.0 * RATE)) / RATE
+    turns = 25.0 * t if from_rest is None else 1.1 * np.clip(t - 1.8, 0.0, None) ** 2
+    turns = turns[-1] - turns[::-1] if from_rest is False else turns
+    places = np.arange(1.0, turns[-1] - 1.0)[:, None] + np.array([0.0, 0.1, 0.22])[:marks]
+    samples = np.cos(2.0 * np.pi * np.outer([1.0, 19.0], turns)).sum(axis=0)
+    samples += rng.normal(0.0, 0.2, t.size)
+    found = checked(samples[None], np.interp(places.ravel(), turns, t)).findings
+    assert found['pulses_per_revolution'].value == marks
+    assert found['spurious'].value['count'] == found['missing'].value['count'] == 0

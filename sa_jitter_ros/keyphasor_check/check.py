@@ -152,7 +152,7 @@ class _Check:
             'clock_rate': self._clock(clock, times),
             **self._jitter(fitted, averages.get(True, ()), hidden),
             'missing': _counted(fitted.lost, hidden or 'marks without a pulse'),
-            'spurious': _counted(fitted.strays, hidden or 'pulses that stand beside every mark'),
+            'spurious': _counted(fitted.spurious, hidden or 'pulses that stand beside every mark'),
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
             'path_delay': UNCHANGED if averages and False not in averages else path_delay(

@@ -61,7 +61,7 @@ def costs(findings: Mapping[str, Checked], fitted: FittedPulses, times: FloatArr
 def _of_pulses(fitted: FittedPulses, orders: Sequence[float]) -> list[Warn]:
     """Return what strays and lost pulses cost where each spoils a revolution."""
     turns = max(fitted.turns, 1.0)
-    strays, lost, total = fitted.strays.size, fitted.lost.size, fitted.true.size
+    strays, lost, total = fitted.spurious.size, fitted.lost.size, fitted.true.size
     found = []
     if strays:
         many = ('. So many were not understood: look at the figure'

@@ -91,6 +91,12 @@ class FittedPulses:
         return np.asarray((self.numbers - self.pattern.origin) / self.pattern.teeth)
 
     @property
+    def spurious(self) -> FloatArray:
+        """Return the strays (m,) in s; before and behind all others the speed is not known."""
+        first, last = np.searchsorted(self.strays, self.measured[[0, -1]])
+        return np.asarray(self.strays[first:last])
+
+    @property
     def unfit(self) -> float:
         """Return how far pulses stand from their marks, in teeth; a stray or a gap counts half."""
         pitch = np.gradient(self.true) / np.gradient(self.numbers.astype(np.float64))
