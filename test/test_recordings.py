@@ -1285,3 +1285,19 @@ def test_a_recording_can_be_sent_to_another_process(tmp_path, rng):
     sent = pickle.loads(pickle.dumps(found))
     np.testing.assert_array_equal(sent.read(), both[:, :1].T)
     np.testing.assert_array_equal(sent.read_tach(), both[:, 1])
+
+
+@pytest.mark.parametrize('decimals', [3, 2])
+def test_times_rounded_to_more_than_a_sample_tell_the_rate(tmp_path, decimals):
+    rows = [f'{k / 2000.0:.{decimals}f},{k % 7}' for k in range(8000)]
+    path = tmp_path / 'rounded.csv'
+    path.write_text('\n'.join(['time,acceleration', *rows]), encoding='utf-8')
+    found = read(path)
+    assert found.sample_rate == pytest.approx(2000.0, rel=1e-4)
+    assert found.start_time == pytest.approx(0.0, abs=10.0 ** -decimals)
+    assert read(path, sample_rate=2000.0).sample_rate == 2000.0
+    with pytest.raises(RecordingError, match='leave it out'):
+        read(path, sample_rate=2100.0)
+    path.write_text('\n'.join(['time,acceleration', *rows[:4000], *rows[4200:]]), encoding='utf-8')
+    with pytest.raises(RecordingError, match='split the file at its gaps'):
+        read(path)

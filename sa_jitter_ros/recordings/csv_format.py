@@ -28,6 +28,7 @@ from sa_jitter_ros.recordings.recording import ArraySource, mapped, Recording
 
 _ROWS_AT_ONCE = 65_536
 _LONGEST_FOOTER = 100  # lines below the table
+_ROUNDED = 1.1  # rows that a step of rounded times spans at least
 
 
 def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
@@ -82,12 +83,20 @@ def _clock(layout: CsvLayout, values: FloatArray, sample_rate: float | None
         raise RecordingError('1 row of samples: give more, or the sample_rate')
     if not np.isfinite([start, end]).all() or (count and not end > start):
         raise RecordingError(f'time runs from {start} to {end} s: sort the rows by time')
+    steps, index = np.diff(times), np.arange(count + 1)
+    measured = count / (end - start) if count else 0.0
+    rounding = float(np.min(steps, where=steps > 0.0, initial=end - start))
+    if rounding * measured > _ROUNDED and np.any(steps == 0.0):
+        start, period = np.polynomial.polynomial.polyfit(index, times, 1).tolist()
+        measured = 1.0 / period
+    else:
+        rounding = 0.0
     if rate is None:
-        rate = count / (end - start)
-    elif not abs((end - start) * rate - count) < 1.0:  # times are rounded: it is the better one
+        rate = measured
+    elif not abs((end - start) * rate - count) < 1.0 + rounding * rate:
         raise RecordingError(f'sample_rate {rate} Hz given, but the times of the file say '
-                             f'{count / (end - start)} Hz: leave it out')
-    astray = np.flatnonzero(~(abs((times - start) * rate - np.arange(count + 1)) < 0.5))
+                             f'{measured} Hz: leave it out')
+    astray = np.flatnonzero(~(abs((times - start) * rate - index) < 0.5 + rounding * rate))
     if astray.size:
         row = int(astray[0])
         raise RecordingError(
