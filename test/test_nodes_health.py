@@ -29,6 +29,7 @@ from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
 from sa_jitter_ros.nodes.tach_detector import TachDetector
 from sa_jitter_ros.samples import SampleBlock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -154,6 +155,50 @@ def test_detector_that_finds_no_pulse_says_so(ros_graph, clock):
     level, text, values = b.diagnostics()
     assert (level, values['waveform_age'], values['pulse_age']) == (WARN, '0.0', 'nan')
     assert text.startswith('no pulse in the waveform for 7 s: does the shaft turn?')
+
+
+def test_input_that_is_refused_is_not_called_silent(averager, clock, monkeypatch):
+    b = averager
+    b.send_pulses([0.0])
+    b.settle()
+    wrong = messages.encode_samples(MACHINE.block(0, 64))
+    wrong.layout.data_offset = 2
+
+    def play(vibration, source):
+        for _ in range(6):
+            clock.now += 1.0
+            b.send('vibration', vibration)
+            b.send_pulses([0.1], source)
+        return b.diagnostics()[1]
+
+    text = play(wrong, 'other')
+    assert '/vibration since the start 6 s ago: what comes is refused: data_offset 2 ' in text
+    assert ("no /tach_pulse for 6 s: what comes is refused: pulses of keyphasor 'other' are "
+            "ignored, those of 'kp' are used: set the parameter keyphasor" in text)
+    assert 'publishes nothing' not in text
+    monkeypatch.setattr(b.node._averager, 'add_samples', lambda block: 1 / 0)
+    good = messages.encode_samples(MACHINE.block(0, 64))
+    assert 'refused: ZeroDivisionError: division by zero' in play(good, 'kp')
+    monkeypatch.undo()
+    monkeypatch.setattr(health, 'time', clock)
+    b.send('vibration', good)
+    b.settle()
+    clock.now += 6.0
+    assert '/vibration for 6 s: /test publishes nothing' in b.diagnostics()[1]
+
+
+@pytest.mark.parametrize(('kind', 'message', 'says'), [
+    ('std_msgs/Float64MultiArray', messages.encode_samples(MACHINE.block(0, 64)),
+     '2 channels: send only the channel of the keyphasor'),
+    ('sensor_msgs/JointState', JointState(name=['elbow'], position=[0.1]),
+     'joint wrist is not in it, only elbow: set the parameter joint')])
+def test_detector_says_why_its_input_is_refused(ros_graph, clock, kind, message, says):
+    b = NodeBench(ros_graph, TachDetector, inputs={'tach_waveform': type(message)}, outputs={},
+                  stale_after=5.0, tach_waveform_type=kind, joint='wrist')
+    for _ in range(6):
+        clock.now += 1.0
+        b.send('tach_waveform', message)
+    assert f'6 s ago: what comes is refused: {says}' in b.diagnostics()[1]
 
 
 @pytest.mark.parametrize(('node', 'parameters', 'ages', 'text'), [

@@ -94,6 +94,8 @@ class MonitoringNode(Node):
         self.health = Health()
         #: Largest number of publishers by topic whose messages do not mix; 0 for any number.
         self.most_publishers: dict[str, int] = {}
+        #: Why the latest message of a topic was not taken, '' where it was.
+        self.refused: dict[str, str] = {}
         self._inputs: dict[str, Subscription] = {}
         self._missing: dict[str, str] = {}
         self._incompatible: dict[Subscription, str] = {}  # and the incompatible policy
@@ -120,20 +122,22 @@ class MonitoringNode(Node):
         A callback that raises another `SaJitterError` has counted itself what it dropped.
         """
         def guarded(message: Any) -> None:
+            self.refused[subscription.topic_name] = ''
             try:
                 callback(message)
-            except MessageError as error:
-                self.counts['messages_rejected'] += 1
-                self.warn(f'{topic}: {error}')
+                return
             except SaJitterError as error:
-                self.warn(f'{topic}: {error}')
+                self.counts['messages_rejected'] += isinstance(error, MessageError)
+                reason = str(error)
             except Exception as error:
                 if not self.context.ok():
                     raise
                 self.counts['messages_rejected'] += 1
                 self.get_logger().error(traceback.format_exc(),
                                         throttle_duration_sec=WARNING_PERIOD)
-                self.warn(f'{topic}: {type(error).__name__}: {error}')
+                reason = f'{type(error).__name__}: {error}'
+            self.refused[subscription.topic_name] = reason
+            self.warn(f'{topic}: {reason}')
 
         def incompatible(info: Any) -> None:
             policy = qos_policy_name_from_kind(info.last_policy_kind).lower()
@@ -243,6 +247,8 @@ class MonitoringNode(Node):
         if others:
             return (f'it is published as {", ".join(others)}, this node takes {kind}: set the '
                     'parameter of its type')
+        if reason := self.refused.get(flow.what):
+            return f'what comes is refused: {reason}'
         names = ', '.join(sorted({_node_name(item) for item in offered}))
         return f'{names} publishes nothing: {flow.look_at}'
 

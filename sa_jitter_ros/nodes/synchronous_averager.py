@@ -133,9 +133,9 @@ class SynchronousAverager(MonitoringNode):
             self._sources.add(source)
         if source != self._keyphasor:
             self._other_keyphasors += 1
-            self.warn(f'tach_pulse: pulses of keyphasor {source!r} are ignored, those of '
-                      f'{self._keyphasor!r} are used: set the parameter keyphasor to choose')
-            return
+            raise SignalError(f'pulses of keyphasor {source!r} are ignored, those of '
+                              f'{self._keyphasor!r} are used: set the parameter keyphasor to '
+                              'choose')
         self._add_pulses(times)
 
     def _add_pulses(self, times: FloatArray) -> None:

@@ -129,6 +129,9 @@ class TachDetector(MonitoringNode):
         assert self._joint is not None
         times = self._joint.pulses(message)
         if times is None:
+            self.refused[self._waveform_flow.what] = (
+                f'joint {self._joint.joint} is not in it, only {", ".join(message.name[:6])}: set '
+                'the parameter joint')
             return
         self._waveform_flow.came()
         self._publish(times)
