@@ -117,6 +117,34 @@ def test_channels_that_a_machine_file_does_not_tell_apart_are_refused(bench):
     assert int(values['messages_rejected']) > 0
 
 
+@pytest.mark.parametrize('blocks', [1, 3])
+def test_averages_of_before_have_their_own_channels(ros_graph, bench, blocks):
+    """Pulses come behind a stray block, or behind the first ones of another source."""
+    shafts = ('shaft', 'other')
+    summaries = {name: ros_graph.capture(f'{name}/summary', DiagnosticArray) for name in shafts}
+    b = bench(shafts=shafts, overrides=[Parameter('machine.channels.0.unit', value='g')])
+    b.send('vibration', messages.encode_samples(MACHINE.block(0, 6400)))
+    for number in range(blocks):
+        b.send('vibration', messages.encode_samples(
+            Machine(channels=3).block(6400 + 640 * number, 640)))
+    b.send_pulses(MACHINE.pulses(0.9))
+    b.settle()
+    for name in shafts:
+        assert len(summaries[name]) == len(b.amplitudes(name)) == 1
+        assert [item.name for item in summaries[name][0].status] == [
+            f'{name}: channel 0', f'{name}: channel 1']
+        assert ' g, ' in summaries[name][0].status[0].values[2].value
+    assert 'Error' not in b.diagnostics()[1]
+
+
+def test_an_error_while_one_shaft_is_published_leaves_the_others(bench, monkeypatch):
+    b = bench(shafts=('shaft', 'other'))
+    monkeypatch.setattr(b.node._shafts['shaft'], 'publish', lambda *_: 1 / 0)
+    b.play(MACHINE, 0.5)
+    assert len(b.amplitudes('other')) == 1
+    assert 'ZeroDivisionError' in b.diagnostics()[1]
+
+
 def test_outputs_are_those_of_the_machine(bench):
     b = bench(trigger_cycles=20)
     b.play(MACHINE, 4.0)

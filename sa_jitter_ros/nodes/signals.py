@@ -11,6 +11,7 @@
 """Signals in, sampled ones and the angle of a joint, and tach pulses out, as the user chose."""
 
 from dataclasses import replace
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Any
 
@@ -35,14 +36,14 @@ class SampleInput:
     """
     Decodes the samples of one topic, and warns of those without header and of a wrong rate.
 
-    With `channels` the samples are in their units, and `scale` has names and units of those of
-    the latest message.
+    With `channels` the samples are in their units; `scale_of` has names and units of a number of
+    channels, and raises ParameterError where these are not known.
     """
 
     def __init__(self, node: MonitoringNode, values: Values,
                  channels: Channels = MappingProxyType({})) -> None:
-        self._node, self._channels = node, channels
-        self.scale = scale_of({}, 0)
+        self._node = node
+        self.scale_of = lru_cache(maxsize=8)(lambda count: scale_of(channels, count))
         key = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
         self.message_type = SAMPLE_TYPES[key]
         self._decoder = SampleDecoder(key, sample_rate=values['sample_rate'],
@@ -56,12 +57,11 @@ class SampleInput:
         if self._decoder.counted and not self._warned:
             self._warned = True
             self._node.warn(NO_HEADER)
-        if len(block.samples) != len(self.scale.names):
-            try:
-                self.scale = scale_of(self._channels, len(block.samples))
-            except ParameterError as error:
-                raise MessageError(str(error)) from None
-        return replace(block, samples=self.scale.apply(block.samples)) if self._channels else block
+        try:
+            scale = self.scale_of(len(block.samples))
+        except ParameterError as error:
+            raise MessageError(str(error)) from None
+        return replace(block, samples=scale.apply(block.samples))
 
     def show_warning(self) -> None:
         """Say in the next diagnostics what is wrong with the samples."""

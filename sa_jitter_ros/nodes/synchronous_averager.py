@@ -12,6 +12,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict
 from typing import Any
 
@@ -58,7 +59,7 @@ class SynchronousAverager(MonitoringNode):
                 raise one_ratio(values, name)
         given = self.parameters.given_values
         limits = LimitWatch(Machine.among(given), names, list(channels_of(given)),
-                            labels=lambda count: self._samples.scale.labels)
+                            labels=lambda count: self._samples.scale_of(count).labels)
         self._shafts = {name: ShaftOutput(self, name, limits) for name in names}
         self._latest = {name: deque[Average](maxlen=_LATEST) for name in names}
         self._averager = streaming_averager(values, buffer_seconds=values['buffer_seconds'])
@@ -144,15 +145,9 @@ class SynchronousAverager(MonitoringNode):
         self._publish(self._averager.add_pulses(times))
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
-        pause = 0.0 if self._values['averaging'] == 'block' else _SUMMARY_PAUSE
-        for name, average in averages:
-            self._average_flow.came()
-            self._shafts[name].publish(average, self._samples.scale, pause)
-            self.set_missing(f'orders of {name}', without_amplitude(average.refused))
-            if f'{name}.orders' in self.parameters.given_values:
-                self._latest[name].append(average)
-                self.set_missing(f'lines of {name}', without_lines(
-                    self._latest[name], fewest=_LATEST))
+        with ExitStack() as stack:  # an error of one does not keep the others
+            for name, average in reversed(averages):
+                stack.callback(self._publish_average, name, average)
         speed = self._averager.take_speed() * self._revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
@@ -166,6 +161,17 @@ class SynchronousAverager(MonitoringNode):
         for line in self._averager.take_messages():
             self._average_flow.look_at = line
             self.warn(line)
+
+    def _publish_average(self, name: str, average: Average) -> None:
+        self._average_flow.came()
+        self._shafts[name].publish(
+            average, self._samples.scale_of(len(average.waveform)),
+            0.0 if self._values['averaging'] == 'block' else _SUMMARY_PAUSE)
+        self.set_missing(f'orders of {name}', without_amplitude(average.refused))
+        if f'{name}.orders' in self.parameters.given_values:
+            self._latest[name].append(average)
+            self.set_missing(f'lines of {name}', without_lines(
+                self._latest[name], fewest=_LATEST))
 
     # --- diagnostics ---
 
