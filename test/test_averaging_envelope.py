@@ -127,3 +127,21 @@ def test_a_spectrum_reaches_beyond_every_bearing_order_in_a_bounded_number_of_li
     assert 100 < orders.size <= 8192
     assert 1.2 * 11.3 < orders[-1] < 1.3 * 11.3
     assert np.ptp(np.diff(orders)) < 1e-9
+
+
+@pytest.mark.parametrize(('band', 'shown', 'says'), [
+    ([], [True, True, False], '250: .* 24 Hz, and vibration of 0 to 5000 Hz, sampled at '
+     '10000 Hz, has an envelope of orders below 208.33 only; .*_band below 5000 Hz'),
+    ([2000.0, 2100.0], [True, False, False], '7.1, 250: .* below 4.1667 only'),
+    ([4000.0, 9000.0], [True, True, False], '250: .* 4000 to 9000 Hz, .* below 41.667 only'),
+    ([6000.0, 9000.0], [False] * 3, '3.9, 7.1, 250: .* orders below 0 only')])
+def test_what_an_envelope_cannot_show_has_no_amplitude(band, shown, says):
+    with pytest.warns(sa.DataWarning, match='no amplitude of bearing orders ' + says):
+        average, = averaged(0.8, 3.9, averages=1, channels=1, bearing_orders=[3.9, 7.1, 250.0],
+                            envelope_band=band)
+    envelope = average.envelope
+    for values in (envelope.found, envelope.amplitudes, envelope.standard_errors):
+        np.testing.assert_array_equal(np.isfinite(values[0]), shown)
+    assert np.isfinite(envelope.mean).all() == any(shown)
+    assert np.isfinite(envelope.spectrum).any() == any(shown)
+    assert (envelope.standard_errors[0, shown] > 0.0).all()

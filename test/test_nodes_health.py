@@ -336,6 +336,19 @@ def test_mesh_orders_that_the_waveform_lacks_stay_a_warning(ros_graph):
         assert text.startswith('condition indicators of shaft: ')
 
 
+def test_bearing_orders_that_the_envelope_cannot_show_stay_a_warning(ros_graph):
+    b = AveragerBench(ros_graph, trigger_cycles=10, shaft__bearing_orders=[3.6],
+                      shaft__envelope_band=[7000.0, 8000.0])
+    found = ros_graph.capture('shaft/envelope_amplitude', Float64MultiArray)
+    b.play(MACHINE, 1.0)
+    for _ in range(2):
+        level, text, _ = b.diagnostics()
+        assert level == WARN
+        assert text.startswith('envelope of shaft: no amplitude of bearing orders 3.6: the shaft ')
+    table = messages.decode_average('envelope_amplitude', found[-1]).values
+    assert np.isnan(table[..., 1:]).all()
+
+
 def test_prediction_follows_the_speed_of_an_average_not_its_jitter(ros_graph, rng):
     cycles, clock = 40, 3000.0
     b = NodeBench(ros_graph, JitterPredictor, inputs={'shaft_speed': Float64}, outputs={},

@@ -264,8 +264,9 @@ def average(vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike,
     if problem := averager.problem:
         warnings.warn(f'no condition indicators: {problem}', DataWarning, stacklevel=2)
     refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
-    if refused:
-        warnings.warn(refused, DataWarning, stacklevel=2)
+    envelopes = [item.envelope.problem for item in found if item.envelope is not None]
+    for line in filter(None, (refused, max(envelopes, default='', key=len))):
+        warnings.warn(line, DataWarning, stacklevel=2)
     if values['orders'] is not None and (none := without_lines(found)):
         warnings.warn(none, DataWarning, stacklevel=2)
     return found

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.pulses.angle_law import angle_law
 from sa_jitter_ros.pulses.resampling import periodic
 from scipy.fft import fft, ifft, next_fast_len
@@ -73,6 +74,21 @@ class EnvelopeSettings:
             raise ParameterError(f'envelope_band is {list(self.band)} Hz: give its lowest and its '
                                  'highest frequency, or nothing for all')
 
+    def shown(self, rate: float, speed: float) -> tuple[float, str]:
+        """
+        Return the order that limits the envelope, and which bearing orders lie beyond it, and why.
+
+        The vibration is sampled at a `rate` (Hz), the shaft turns at a `speed` (Hz).
+        """
+        low, high = self.band or (0.0, 0.5 * rate)
+        shown = max(min(high, 0.5 * rate) - low, 0.0) / speed
+        lost = [order for order in self.bearing_orders if order >= shown]
+        return shown, (
+            f'no amplitude of bearing orders {listed(lost)}: the shaft turns at {speed:.5g} Hz, '
+            f'and vibration of {low:g} to {high:g} Hz, sampled at {rate:g} Hz, has an envelope of '
+            f'orders below {shown:.5g} only; drop such orders, or give a wider envelope_band '
+            f'below {0.5 * rate:g} Hz') if lost else ''
+
     def orders(self, revolutions: float) -> FloatArray:
         """Return the orders of the spectrum of an average over so many revolutions."""
         count = math.ceil(_ROOM * max(self.bearing_orders, default=0.0) * revolutions)
@@ -89,7 +105,8 @@ class Envelope:
     line within 2 % of it, `amplitudes` its peak amplitude in the squared unit of the channel, and
     `standard_errors` that of the noise around. `mean` (channel,) is the mean squared envelope,
     twice the power of the residual signal. `spectrum` (channel, line) are the amplitudes at
-    `orders` (line,).
+    `orders` (line,). The squared envelope of a band is as wide as its part below half the sampling
+    rate: amplitudes beyond are NaN, and `problem` says which bearing orders have none, and why.
     """
 
     bearing_orders: FloatArray
@@ -99,6 +116,7 @@ class Envelope:
     mean: FloatArray
     orders: FloatArray
     spectrum: FloatArray
+    problem: str = ''
 
 
 def residual_envelope(
@@ -134,9 +152,12 @@ def residual_envelope(
     resolution = 1.0 / (cycle_length * (int(cycle_numbers[-1] - cycle_numbers[0]) + 1))
     orders = settings.orders(cycle_length * trigger_cycles)
     rows = [_around(lines, order, resolution) for order in settings.bearing_orders]
-    found, amplitudes, errors = (np.stack(item, axis=1) for item in zip(*rows))
-    return Envelope(np.array(settings.bearing_orders), found, amplitudes, errors,
-                    lines.mean, orders, lines.at(orders))
+    shown, problem = settings.shown(cycles[0].rate, cycle_length / period)
+    bearings = np.array(settings.bearing_orders)
+    found, amplitudes, errors = (
+        np.where(bearings < shown, np.stack(item, axis=1), np.nan) for item in zip(*rows))
+    return Envelope(bearings, found, amplitudes, errors, np.where(shown, lines.mean, np.nan),
+                    orders, np.where(orders < shown, lines.at(orders), np.nan), problem)
 
 
 def _periodic(fine: FloatArray, angle: FloatArray) -> FloatArray:

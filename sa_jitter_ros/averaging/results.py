@@ -76,6 +76,8 @@ class ShaftResults:
 
     def __init__(self, gear: GearSettings | None = None) -> None:
         self._indicators = ShaftIndicators(gear)
+        #: Which bearing orders the latest average has no amplitude of, and why.
+        self.bearing_problem = ''
 
     @property
     def problem(self) -> str:
@@ -109,6 +111,7 @@ class ShaftResults:
                 (average.pulses, correction.pulse_errors, correction.standard_errors,
                  average.used), axis=1), PULSE_ERROR_FIELDS)
         envelope = average.envelope or best_of(average).envelope
+        self.bearing_problem = envelope.problem if envelope is not None else ''
         if envelope is not None:
             found |= {name: AverageMessage(header, *content)
                       for name, content in envelope_tables(envelope).items()}

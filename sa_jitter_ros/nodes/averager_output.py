@@ -75,6 +75,7 @@ class ShaftOutput:
                 self._node.parameters.machine, self._limits.passed(self._name)))
         self.published += 1
         self._node.set_missing(f'condition indicators of {self._name}', self._results.problem)
+        self._node.set_missing(f'envelope of {self._name}', self._results.bearing_problem)
         constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])
         lacking = np.all(np.isnan(average.waveform), axis=1)
         for channel, (is_constant, is_lacking) in enumerate(zip(constant, lacking)):

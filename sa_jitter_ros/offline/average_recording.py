@@ -159,6 +159,7 @@ class RecordingAverager:
             found += [lost_inside_revolutions(
                 self.pulses, self.stream.shafts[item.shaft].settings,
                 target['pulses_per_revolution'], target['missing_teeth']) for item in series]
+        found += [item.bearing_problem for item in self._results.values()]
         weak = []  # a shaft of which the vibration shows nothing is no mistake beside others
         for item in series:
             settings = self.stream.shafts[item.shaft].settings

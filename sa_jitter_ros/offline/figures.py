@@ -196,8 +196,8 @@ def envelope_figure(signals: Signals, series: ShaftSeries) -> Figure | None:
     if 'envelope_spectrum' not in series:
         return None
     orders, spectrum = np.moveaxis(series['envelope_spectrum'], -1, 0)
-    found = np.nan_to_num(series['envelope_amplitude'])
-    known = np.isfinite(spectrum).all(axis=(1, 2))
+    found = series['envelope_amplitude']
+    known = np.isfinite(spectrum).any(axis=(1, 2))
     if not known.any():
         return None
     channels = strongest_channels(series)
