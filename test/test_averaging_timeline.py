@@ -302,9 +302,19 @@ def test_source_that_changed_for_good_is_followed_from_its_second_block_on(new):
     assert timeline.layout == (new.get('channels', 1), new.get('rate', RATE))
 
 
-def test_rate_may_differ_by_rounding():
-    timeline = timeline_of(block(0, 100), block(100, 100, rate=RATE * (1.0 + 1e-12)))
-    assert held(timeline) == [(0, 0.0, 199.0)]
+def test_rate_may_be_measured_anew_for_each_block():
+    rates = RATE * (1.0 + np.array([2.0, -3.0, 1.0, 5.0, -7.0, 9.0]) * 1e-5)
+    timeline = timeline_of(*(block(100 * k, 100, rate=rate) for k, rate in enumerate(rates)))
+    assert [(item.index, item.end_index, item.clock.rate) for item in timeline.segments] == [
+        (0, 600, rates[0])]
+    assert timeline.layout == (1, rates[0])
+    assert (timeline.counts.blocks_rejected, timeline.messages) == (0, [])
+
+
+def test_rates_that_differ_look_different_in_the_message():
+    timeline = timeline_of(block(0, 100))
+    with pytest.raises(SignalError, match=r'1 channels at 1000\.2 Hz in a stream of 1 at 1000 Hz'):
+        timeline.add(block(100, 100, rate=1000.2))
 
 
 def test_oldest_samples_go_beyond_the_buffer():

@@ -10,6 +10,7 @@
 
 """The averager node through real publishers, subscribers and parameter services."""
 
+from dataclasses import replace
 import math
 import re
 import signal
@@ -485,6 +486,25 @@ def test_lasting_change_of_channels_is_averaged(bench):
     assert {item.values.shape[0] for item in b.amplitudes()[before:]} == {3}
     assert len(b.amplitudes()) - before >= 2
     assert_true(b.amplitudes()[before:], other, ORDERS)
+
+
+def test_rate_that_the_source_measures_for_each_block_is_that_of_the_run(bench, rng):
+    b = bench()
+    b.play(MACHINE, 1.0, change=lambda number, block: [replace(
+        block, sample_rate=MACHINE.rate + 0.02 * rng.standard_normal())])
+    assert len(b.amplitudes()) == 3
+    assert_true(b.amplitudes(), MACHINE, ORDERS, rtol=2e-3)
+    level, _, values = b.diagnostics()
+    assert (level, values['messages_rejected']) == (DiagnosticStatus.OK, '0')
+
+
+def test_other_channels_at_continuing_times_are_a_gap(bench):
+    b = bench()
+    b.play(MACHINE, 0.5)
+    for index in (6400, 7040, 7680):
+        b.send('vibration', messages.encode_samples(Machine(channels=1).block(index, 640)))
+    status = b.status()
+    assert (status['gaps'], status['restarts'], status['messages_rejected']) == (1, 0, 1)
 
 
 def test_orders_and_shafts_beyond_nyquist(bench):

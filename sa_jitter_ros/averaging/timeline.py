@@ -27,7 +27,7 @@ from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved_times
 
 _Span = tuple[int, int]  # first index, and the one behind the last
 
-SAME_RATE = 1e-9  # relative difference of sampling rates that are equal to rounding
+_SAME_RATE = 1e-4  # relative: a source may state the rate that it measures
 _KEPT = 200  # spans that are remembered
 
 
@@ -193,9 +193,9 @@ class TimelineCounts:
 
 
 def _alike(layout: tuple[int, float] | None, other: tuple[int, float]) -> bool:
-    """Whether the number of channels is the same, and the rate (Hz) within rounding."""
+    """Whether the number of channels is the same, and the rate (Hz) as far as it is measured."""
     return (layout is not None and layout[0] == other[0]
-            and math.isclose(layout[1], other[1], rel_tol=SAME_RATE))
+            and math.isclose(layout[1], other[1], rel_tol=_SAME_RATE))
 
 
 @dataclass
@@ -234,10 +234,10 @@ class VibrationTimeline:
 
     @property
     def layout(self) -> tuple[int, float] | None:
-        """Return the number of channels and sampling rate (Hz), None before the first block."""
-        if self._last is None:
+        """Return channels and sampling rate (Hz) of the run, None before the first block."""
+        if self._last is None or self._clock is None:
             return None
-        return self._last.samples.shape[0], self._last.sample_rate
+        return self._last.samples.shape[0], self._clock.rate
 
     @property
     def end_time(self) -> float:
@@ -352,8 +352,8 @@ class VibrationTimeline:
             return True
         self._odd = layout
         raise SignalError(
-            f'block of {layout[0]} channels at {layout[1]:g} Hz in a stream of {self.layout[0]} '
-            f'at {self.layout[1]:g} Hz: send the same layout, or restart the source')
+            f'block of {layout[0]} channels at {layout[1]:.10g} Hz in a stream of '
+            f'{self.layout[0]} at {self.layout[1]:.10g} Hz: send one layout or restart the source')
 
     def _follows(self, block: SampleBlock, following: SampleBlock) -> bool:
         expected = block.start_time + block.samples.shape[1] / block.sample_rate
@@ -400,7 +400,7 @@ class VibrationTimeline:
         elif self.layout and not _alike(self.layout, (len(block.samples), block.sample_rate)):
             self.counts.gaps += 1
             self.messages.append(f'source continues at {block.start_time:.6f} s with '
-                                 f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
+                                 f'{len(block.samples)} channels at {block.sample_rate:.10g} Hz')
         self._clock = SampleClock(block.start_time, block.index, block.sample_rate)
         self._gap, self._ledger = (0, 0), SampleLedger()
         self._store(block.samples, block.index)

@@ -13,12 +13,11 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-import math
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
-from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
@@ -69,8 +68,7 @@ class TachDetector(MonitoringNode):
                 **SAMPLE_TYPES, JOINT_TYPE: JointState})})
         self._timeline = VibrationTimeline(time_tolerance=values['time_tolerance'])
         self._detector = detector_of(values)
-        self._rate = 0.0  # of the run that the detector follows
-        self._epoch = 0
+        self._run = 0, 0.0  # epoch and sampling rate of what the detector follows
         self._pulses = self._unsendable = 0
         self._too_close = self._unused = self._spikes = 0  # of earlier detectors
         self._waiting: deque[float] = deque()
@@ -115,12 +113,11 @@ class TachDetector(MonitoringNode):
             raise
         self._waveform_flow.came()
         for epoch, samples in self._timeline.take():
-            same = math.isclose(samples.sample_rate, self._rate, rel_tol=SAME_RATE)
-            if epoch != self._epoch or not same:  # the learnt levels are those of another run
+            if (epoch, samples.sample_rate) != self._run:  # the learnt levels are of another one
                 self._begin(self._values)
-                self._epoch, self._rate = epoch, samples.sample_rate
+                self._run = epoch, samples.sample_rate
             self._publish(self._detector.update(
-                samples.samples[0], samples.start_time, self._rate))
+                samples.samples[0], samples.start_time, samples.sample_rate))
         for line in self._timeline.messages:
             self.warn(line)
         self._timeline.messages.clear()
