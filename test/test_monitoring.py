@@ -198,6 +198,17 @@ def test_scores_of_a_short_baseline_are_normal(rng, level):
     assert found == pytest.approx(wanted, abs=4.0 * np.sqrt(wanted / 40_000))
 
 
+@pytest.mark.parametrize('value', [0.0, 1e-300, 3.0])
+def test_a_constant_has_no_skewness_whatever_it_is(value):
+    place, none = SpeedBin((1, 1)), np.zeros((1, 1))
+    values = np.full((1, 1), value)
+    for _ in range(3):
+        scores, weights = place.score(values, none, none, np.ones((1, 1)))
+        place.learn(values, none, none, weights, none > 0.0)
+    np.testing.assert_array_equal(place.baseline().skewness, none)
+    np.testing.assert_array_equal(scores, np.zeros((3, 1, 1)))
+
+
 def test_skewness_that_the_baseline_shows_is_no_change(rng):
     """Of a gamma distribution, 1 % of which lie 3 standard deviations above the mean."""
     assert np.mean(scored(rng.gamma(4.0, size=(300, 3000))) > 3.0) < 0.006

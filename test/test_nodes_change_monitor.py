@@ -460,6 +460,21 @@ def test_baseline_of_another_machine_is_refused_and_kept(learned):
     assert path.read_bytes() == before
 
 
+def test_averages_of_another_machine_are_one_steady_error(ros_graph, capfd):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(22)
+    b.play(machine, 5)
+    levels = []
+    for add in (1.0, 1.0, 0.0, 0.0, 1.0):
+        arrays = machine.messages()
+        arrays[0].values[..., 0] += add
+        for kind, array in zip(KINDS, arrays):
+            b.send(f'input/{kind}', messages.encode_average(kind, array))
+            levels.append(b.diagnostics()[0])
+    assert levels == [OK] * 3 + [ERROR] * 8 + [OK] * 8 + [ERROR]
+    log = capfd.readouterr().err
+    assert log.count('[ERROR]') == log.count('orders 2, 20, 39') == 2
+
+
 def test_baseline_survives_a_restart_without_any_setting(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     machine = DrawnMachine(13)

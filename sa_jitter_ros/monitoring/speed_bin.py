@@ -66,7 +66,7 @@ class Moments:
         third = cube - 3.0 * mean * square + 2.0 * mean**3
         centre = mean + reference
         floor = (_ROUNDING * centre) ** 2 + _TINY
-        skewness = third / np.maximum(variance, floor) ** 1.5
+        skewness = (np.cbrt(third) / np.sqrt(np.maximum(variance, floor))) ** 3
         variance = np.maximum(variance * count / (known - 1.0), floor)
         return cls(count, centre, variance, skewness, noise, doubt)
 

@@ -180,7 +180,7 @@ class ChangeMonitor(MonitoringNode):
         except ParameterError as error:
             self._fail(f'baseline of {shaft}', f'{self._path or "baseline"}: {error}')
             return
-        if kind == KINDS[0]:
+        if self._monitor.averages != before:
             self._fail(f'baseline of {shaft}', '')
         for line in lines:
             self.get_logger().warning(line)
