@@ -16,7 +16,7 @@ import math
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
-from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.samples import SampleBlock
 
@@ -324,6 +324,24 @@ def test_oldest_samples_go_beyond_the_buffer():
         timeline.bound()
     assert held(timeline) == [(0, 300.0, 549.0)]
     assert timeline.counts.samples_dropped == 250
+
+
+def test_a_thousand_segments_are_bounded_in_one_pass(monkeypatch):
+    timeline, size, reads = VibrationTimeline(buffer_seconds=2.0), Segment.size, []
+    for k in range(20):
+        item = block(200 * k, 200)
+        item.samples[:, ::4] = np.nan
+        timeline.add(item)
+    monkeypatch.setattr(Segment, 'size', property(
+        lambda segment: reads.append(0) or size.fget(segment)))
+    timeline.bound()
+    assert len(reads) < 4 * 1000
+    assert sum(len(item.samples) for item in timeline.segments) == 2000
+    assert timeline.counts.samples_dropped == 1000 + 1000
+    assert sum(len(item._data) for item in timeline.segments) < 100 * len(timeline.segments)
+    for segment in timeline.segments[::50]:
+        assert segment in timeline.around(0, segment.start_time)
+        assert segment in timeline.around(0, segment.end_time)
 
 
 def test_release_forgets_older_epochs_and_closed_segments():

@@ -406,11 +406,11 @@ class StreamingAverager:
         if epoch > timeline.epoch:
             return None
         ahead = True
-        for segment in timeline.segments:
-            if segment.epoch != epoch or not len(segment.samples):
+        for segment in timeline.around(epoch, start):
+            if segment.epoch != epoch or not segment.size:
                 continue
             low, high = segment.position(start), segment.position(end)
-            last = len(segment.samples) - 1
+            last = segment.size - 1
             ahead = low > last
             if low < -1e-6 or ahead:
                 continue

@@ -16,6 +16,7 @@ in the index ends a segment; a source that restarts opens a new epoch. All of th
 `buffer_seconds` limits the memory: the oldest samples are dropped first.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 import math
 
@@ -74,6 +75,11 @@ class Segment:
         return self._index + self._end
 
     @property
+    def size(self) -> int:
+        """Number of samples held."""
+        return self._end - self._begin
+
+    @property
     def samples(self) -> FloatArray:
         """Return the samples as (sample, channel), without a copy."""
         return self._data[self._begin:self._end]
@@ -101,7 +107,7 @@ class Segment:
         count = samples.shape[1]
         if self._end + count > len(self._data):
             kept = self.samples
-            size = max(4 * (len(kept) + count), 1024)
+            size = max(4 * (len(kept) + count), 64)
             data = room((size, kept.shape[1]))
             data[:len(kept)] = kept
             self._index, self._data = self.index, data
@@ -288,7 +294,7 @@ class VibrationTimeline:
         """Remove and return all samples, segment by segment, each with its epoch."""
         taken = [(item.epoch, SampleBlock(item.samples.T, item.start_time, item.clock.rate,
                                           item.index))
-                 for item in self.segments if len(item.samples)]
+                 for item in self.segments if item.size]
         for item in self.segments:
             item.trim(item.end_index)
         self._tidy()
@@ -312,21 +318,27 @@ class VibrationTimeline:
             following = begin
         return found
 
+    def around(self, epoch: int, time: float) -> list[Segment]:
+        """Return the few segments before and behind a time (s) of an epoch, in their order."""
+        place = bisect_right(self.segments, (epoch, time),
+                             key=lambda item: (item.epoch, item.start_time))
+        return self.segments[max(place - 2, 0):place + 2]
+
     def bound(self) -> None:
         """Drop and count the oldest samples beyond `buffer_seconds`."""
         if math.isinf(self.buffer_seconds):
             return
+        held = sum(item.size for item in self.segments)
         for segment in self.segments:
-            excess = (sum(len(item.samples) for item in self.segments)
-                      - round(self.buffer_seconds * segment.clock.rate))
+            excess = held - round(self.buffer_seconds * segment.clock.rate)
             if excess <= 0:
                 break
+            held -= min(excess, segment.size)
             self.counts.samples_dropped += segment.trim(segment.index + excess)
         self._tidy()
 
     def _tidy(self) -> None:
-        self.segments = [item for item in self.segments
-                         if len(item.samples) or not item.closed]
+        self.segments = [item for item in self.segments if item.size or not item.closed]
 
     # --- continuity ---
 
