@@ -201,6 +201,21 @@ def test_detector_says_why_its_input_is_refused(ros_graph, clock, kind, message,
     assert f'6 s ago: what comes is refused: {says}' in b.diagnostics()[1]
 
 
+def test_stamps_of_joints_that_nobody_fills_are_named(ros_graph, clock):
+    b = NodeBench(ros_graph, TachDetector, inputs={'tach_waveform': JointState}, outputs={},
+                  stale_after=5.0, tach_waveform_type='sensor_msgs/JointState')
+    says = 'stamps do not advance from 0 s on: fill header.stamp with the time of measurement'
+    for number in range(7):
+        b.send('tach_waveform', JointState(name=['wrist'], position=[0.1 * number]))
+        b.settle()
+        if number == 1:
+            assert b.diagnostics()[:2] == (WARN, f'tach_waveform: {says}')
+        clock.now += 1.0
+    level, text, values = b.diagnostics()
+    assert (level, text) == (WARN, f'no /tach_waveform for 7 s: what comes is refused: {says}')
+    assert values['samples_dropped'] == '6'
+
+
 @pytest.mark.parametrize(('node', 'parameters', 'ages', 'text'), [
     (JitterPredictor, {'follow_shaft_speed': True}, {'speed_age', 'prediction_age'},
      'no /shaft_speed'),

@@ -12,12 +12,13 @@
 
 from dataclasses import replace
 from functools import lru_cache
+import math
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
-from sa_jitter_ros.errors import MessageError, ParameterError
+from sa_jitter_ros.errors import MessageError, ParameterError, SignalError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     decode_time, encode_pulse_array, encode_pulse_reference, known_type, PULSE_TYPES, SAMPLE_TYPES,
@@ -121,9 +122,14 @@ class JointInput:
         self.joint = joint
         self.crossings = AngleCrossings(marks=marks, time_tolerance=time_tolerance)
         self.others = 0
+        self._time = math.nan  # s, the latest stamp
 
     def pulses(self, message: Any) -> FloatArray | None:
-        """Return new pulse times (s), None for a message of others; raises MessageError."""
+        """
+        Return new pulse times (s), None for a message of others.
+
+        Raises MessageError, and SignalError for a stamp that came before, which is counted.
+        """
         names = list(message.name)
         if not self.joint:
             if len(names) != 1:
@@ -139,7 +145,12 @@ class JointInput:
                                f'{self.joint} needs its position in rad')
         stamp = message.header.stamp
         time = decode_time(stamp.sec, stamp.nanosec)
-        return self.crossings.update([time], [float(message.position[index])])
+        pulses = self.crossings.update([time], [float(message.position[index])])
+        if time == self._time:
+            raise SignalError(f'stamps do not advance from {time:.9g} s on: fill header.stamp '
+                              'with the time of measurement')
+        self._time = time
+        return pulses
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return what the node says of its state, and the values behind it."""
