@@ -360,6 +360,42 @@ def test_one_keyphasor_is_used_and_the_others_counted(bench, named):
     assert status['keyphasor'] == 'kp'
 
 
+@pytest.mark.parametrize(('end', 'says'), [
+    (2.4, 'no valid pulses from 0.780000 s to 2.400000 s: 54 trigger cycles discarded'),
+    (2.41, 'no valid pulses from 0.780000 s to 2.410000 s: an unknown number of trigger cycles '
+     'discarded'),
+    (0.84, None)])
+def test_a_gap_of_the_pulses_is_said_with_what_it_cost(bench, end, says):
+    b = bench()
+    for number in range(20):
+        b.send('vibration', messages.encode_samples(MACHINE.block(2560 * number, 2560)))
+        for start, stop, first in ((0, 27, 0.0), (0, 40, end)):
+            times = first + np.arange(start, stop) * 0.03
+            b.send_pulses(times[(times >= 0.2 * number) & (times < 0.2 * number + 0.2)])
+    b.settle()
+    text = b.diagnostics()[1]
+    assert (says or 'cycles_dropped') in text
+    assert ('no valid pulses' in text) == bool(says)
+    assert len(b.amplitudes()) >= 5
+
+
+@pytest.mark.parametrize(('vibration', 'pulses', 'says'), [
+    (1.7e9, 0.0, r'no vibration without a gap from .* s to .* s \(vibration begins at '
+     r'1700000000.000000 s: time both by one clock\): \d+ trigger cycles discarded'),
+    (0.0, 1.7e9, r'trigger pulses waited longer than buffer_seconds = 0.5 s for vibration, which '
+     r'ends at 0.\d+ s: is it published, on the clock of the pulses\?')])
+def test_vibration_and_pulses_of_two_clocks_are_named(bench, vibration, pulses, says):
+    b = bench(buffer_seconds=0.5)
+    b.send_pulses(pulses + MACHINE.pulses(0.4))
+    b.settle()
+    b.send('vibration', messages.encode_samples(MACHINE.block(0, 1280, start=vibration)))
+    b.settle()
+    text = b.diagnostics()[1]
+    b.send_pulses(pulses + MACHINE.pulses(1.0, 0.4))
+    text += b.diagnostics()[1]
+    assert re.search(says, text)
+
+
 def test_keyphasor_may_have_an_empty_name(bench):
     b = bench()
     b.send_pulses([-0.5], source='')

@@ -43,6 +43,8 @@ from sa_jitter_ros.samples import SampleBlock
 TRIGGER = np.dtype([('time', np.float64), ('elapsed', np.float64), ('epoch', np.int64),
                     ('skipped', np.int64), ('starts_run', np.bool_), ('mark', np.int64)])
 
+_FEW, _SILENCE = 3, 1.0  # trigger cycles and s: longer gaps of the pulses are said
+
 
 class TriggerQueue:
     """Trigger pulses in an array (`items`), added at the end and removed at the start."""
@@ -223,7 +225,7 @@ class StreamingAverager:
         self._recovered = RecoveredMarks(validator.pulses_per_revolution)
         self._ramps = {name: ErrorRamp() for name in self.shafts}
         self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
-        self._triggers = TriggerQueue()
+        self._triggers, self._last_time = TriggerQueue(), np.nan
         self._next = 0
         self._begin_run()
 
@@ -264,8 +266,15 @@ class StreamingAverager:
         skipped = triggers.count - np.concatenate(((self._last_count,), triggers.count[:-1]))
         items['epoch'] = epochs
         items['starts_run'] = triggers.starts_run | changed
-        items['skipped'] = np.where(changed | triggers.restarted, 0, np.maximum(skipped, 0))
+        anew = changed | triggers.restarted
+        items['skipped'] = np.where(anew, 0, np.maximum(skipped, 0))
         self._pulse_epoch = int(epochs[-1])
+        before = np.concatenate(((self._last_time,), triggers.times[:-1]))
+        long = (items['skipped'] > _FEW) | (triggers.times - before > _SILENCE)
+        for number in np.flatnonzero(triggers.starts_run & long & ~anew):
+            self._messages.append(
+                f'no valid pulses from {before[number]:.6f} s to {triggers.times[number]:.6f} s: '
+                f'{items["skipped"][number] or "an unknown number of"} trigger cycles discarded')
 
     def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
         """Return the epoch of each pulse."""
@@ -294,9 +303,11 @@ class StreamingAverager:
         keep = int(np.argmax(waiting['elapsed'][-1] - waiting['elapsed'] <= limit))
         if keep:
             self.counts.pulses_dropped += keep * self.validator.pulses_per_trigger
+            ends = self.timeline.end_time
+            where = f', which ends at {ends:.6f} s' if np.isfinite(ends) else ''
             self._discard(keep, f'{keep} trigger pulses waited longer than buffer_seconds = '
-                          f'{limit:g} s for vibration: is it published, on the clock of the '
-                          'pulses? (raise it for a slower shaft only)')
+                          f'{limit:g} s for vibration{where}: is it published, on the clock of '
+                          'the pulses? (raise it for a slower shaft only)')
         self._forget_used()
 
     # --- cycles ---
@@ -428,6 +439,8 @@ class StreamingAverager:
             if end - start + 2 * margin / rate > timeline.buffer_seconds:
                 return (' (the cycle is longer than buffer_seconds = '
                         f'{timeline.buffer_seconds:g} s: raise it)')
+        if timeline.segments and (first := timeline.segments[0].start_time) > end:
+            return f' (vibration begins at {first:.6f} s: time both by one clock)'
         return ''
 
     def _hand_over(self, segment: Segment, count: int, margin: int, stop: int) -> None:
