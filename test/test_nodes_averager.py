@@ -364,6 +364,7 @@ def test_one_keyphasor_is_used_and_the_others_counted(bench, named):
     (2.4, 'no valid pulses from 0.780000 s to 2.400000 s: 54 trigger cycles discarded'),
     (2.41, 'no valid pulses from 0.780000 s to 2.410000 s: an unknown number of trigger cycles '
      'discarded'),
+    (0.99, 'no valid pulses from 0.780000 s to 0.990000 s: 7 trigger cycles discarded'),
     (0.84, None)])
 def test_a_gap_of_the_pulses_is_said_with_what_it_cost(bench, end, says):
     b = bench()
