@@ -585,3 +585,12 @@ def test_pulses_before_and_behind_those_whose_speed_is_known_are_not_spurious(
     found = checked(samples[None], np.interp(places.ravel(), turns, t)).findings
     assert found['pulses_per_revolution'].value == marks
     assert found['spurious'].value['count'] == found['missing'].value['count'] == 0
+
+
+def test_marks_that_are_close_together_are_no_wheel_that_stands_still_every_turn(rng):
+    """As torn reflective tape gives them, or an edge that bounces."""
+    time, angle = motion()
+    places = np.arange(1.0, angle[-1] - 1.0)[:, None] + np.array([0.0, 0.016, 0.03])
+    found = checked(vibration(rng), np.interp(places.ravel(), angle, time)).findings
+    assert found['pulses_per_revolution'].value == 3
+    assert found['speed'].value['mean'] == pytest.approx(angle[-1] / time[-1], rel=0.02)

@@ -101,7 +101,7 @@ class FittedPulses:
         """Return how far pulses stand from their marks, in teeth; a stray or a gap counts half."""
         pitch = np.gradient(self.true) / np.gradient(self.numbers.astype(np.float64))
         away = np.abs(_beside(self.true, self.numbers, np.maximum(pitch, 1e-300)))
-        wrong = self.strays.size + self.lost.size
+        wrong = self.strays.size + self.lost.size + self.breaks.size
         return float(np.minimum(away, 0.5).sum() + 0.5 * wrong) / (self.true.size + wrong)
 
     @property
@@ -159,7 +159,7 @@ def _number_and_patterns(times: FloatArray) -> tuple[NumberedPulses, list[Markin
         found = patterns(numbered)
     found = [item for item in found if item.present > 1]
     first = fit_pulses(numbered, found[0].teeth if found else 1)
-    wrong = first.strays.size + first.lost.size
+    wrong = first.strays.size + first.lost.size + first.breaks.size
     marks = number_marks(times) if wrong * MOST_MARKS > _OFTEN * times.size else None
     uneven = [item for item in patterns(marks) if item.present > 1] if marks is not None else []
     if marks is not None and uneven:
