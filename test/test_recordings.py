@@ -1301,3 +1301,12 @@ def test_times_rounded_to_more_than_a_sample_tell_the_rate(tmp_path, decimals):
     path.write_text('\n'.join(['time,acceleration', *rows[:4000], *rows[4200:]]), encoding='utf-8')
     with pytest.raises(RecordingError, match='split the file at its gaps'):
         read(path)
+
+
+def test_a_tach_rate_in_khz_is_named_before_pulses_are_looked_for(rng):
+    tach = (np.arange(200_000) % 400 < 40) + 0.01 * rng.standard_normal(200_000)
+    recording = Recording(ArraySource(rng.standard_normal((1, 200_000))), 1e4,
+                          tach=ArraySource(tach[None]), tach_rate=10.0)
+    with pytest.raises(RecordingError, match='looks like kHz; give tach_rate=10000'):
+        recording.keyphasor_pulses()
+    assert replace(recording, tach_rate=1e4).keyphasor_pulses().size == 499

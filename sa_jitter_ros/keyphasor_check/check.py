@@ -59,7 +59,6 @@ _MOST_SAMPLES = 12_000_000
 # of interest; and the probability that another one is, all the same.
 _FEWEST_OWN, _ANOTHER = 3, 0.25
 _APART = 4.0  # standard errors
-_KILO = (500.0, 2000.0)  # times as long: a rate in kHz instead of Hz
 _FEWEST_SAMPLES = 16
 # Share of strays and lost pulses, and mean distance of the others from their marks (teeth): pulses
 # at random have 0.58 to 0.8 and 0.07 to 0.13; a quarter lost and as many strays 0.6 and 0.056.
@@ -207,16 +206,11 @@ class _Check:
 
     def _check_tach_rate(self) -> None:
         """Take a tach rate for kHz if the waveform then is as long as the vibration."""
-        recording = self._recording
-        if not self._from_waveform or recording.tach is None or not recording.tach_rate:
-            return
-        length = recording.tach.samples / recording.tach_rate
-        if _KILO[0] < length / recording.duration < _KILO[1]:
-            self._warn(
-                'unit_khz', f'the tach waveform spans {length:.6g} s, the vibration '
-                f'{recording.duration:.6g} s: tach_rate looks like kHz; give '
-                f'tach_rate={1e3 * recording.tach_rate:.10g}')
-            self._recording = replace(recording, tach_rate=1e3 * recording.tach_rate)
+        text = self._recording.tach_in_khz
+        if self._from_waveform and text and self._recording.tach_rate:
+            self._warn('unit_khz', text)
+            self._recording = replace(
+                self._recording, tach_rate=1e3 * self._recording.tach_rate)
 
     def _span(self, times: FloatArray) -> None:
         end = self._start + self._recording.samples / self._rate

@@ -30,6 +30,7 @@ from sa_jitter_ros.samples import SampleBlock, unresolved_times
 
 _MAX_CHANNELS = 4096
 _LONGEST = 500  # characters of an error that may quote a recording
+_KILO = 500.0, 2000.0  # times as long: a rate in kHz instead of Hz
 MAX_PULSES = 50_000_000
 
 
@@ -288,9 +289,21 @@ class Recording:
             raise RecordingError('no keyphasor: the recording has neither pulse_times nor a tach '
                                  'waveform; add one of them, or name the channel that is the '
                                  'waveform (tach_channel, --tach-channel)')
+        if self.tach_in_khz:
+            raise RecordingError(self.tach_in_khz)
         count = math.ceil(min(duration * self.tach_rate, self.tach.samples))
         return pulses_in_blocks(detector or KeyphasorDetector(interpolate=interpolate),
                                 self._tach_samples(count, self.tach_rate))
+
+    @property
+    def tach_in_khz(self) -> str:
+        """Say if the tach waveform is a thousand times as long as the vibration, '' if not."""
+        if self.tach is None or not self.tach_rate:
+            return ''
+        length = self.tach.samples / self.tach_rate
+        return '' if not _KILO[0] < length / self.duration < _KILO[1] else (
+            f'the tach waveform spans {length:.6g} s, the vibration {self.duration:.6g} s: '
+            f'tach_rate looks like kHz; give tach_rate={1e3 * self.tach_rate:.10g}')
 
     def _tach_samples(self, count: int, rate: float) -> Iterator[SampleBlock]:
         index = 0
