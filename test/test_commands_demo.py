@@ -226,19 +226,6 @@ def test_output_that_fails_at_the_end_is_one_line_and_status_2(monkeypatch, tmp_
     assert capsys.readouterr().err.startswith(f'demo: {tmp_path}: No space left on device: ')
 
 
-@pytest.mark.processes
-def test_a_measured_recording_gives_averages_whose_loss_is_known(
-        shared_data, process_environment, tmp_path):
-    done = run_demo(process_environment, str(shared_data / 'motor_30V_100kHz.npz'), '--output',
-                    str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    rows = [row for row in map(str.split, done.stdout.splitlines())
-            if row and re.fullmatch(r'\d+', row[0])]
-    attenuation = np.array([float(row[-5]) for row in rows])
-    assert len(rows) >= 5
-    np.testing.assert_allclose(attenuation, 1.0, atol=0.01, err_msg=done.stdout)
-
-
 def test_node_that_does_not_end_is_killed(monkeypatch):
     deaf = subprocess.Popen([sys.executable, '-c', (
         'import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); '

@@ -573,10 +573,10 @@ def test_what_marks_do_not_show_of_the_speed_is_given_in_per_cent():
     assert dict(found.cost) == {1.0: 10.0, 2.0: 20.0}
 
 
-@pytest.mark.parametrize(('from_rest', 'marks'), [(True, 1), (False, 1), (None, 2), (None, 3)])
+@pytest.mark.parametrize(('from_rest', 'marks'), [(True, 1), (False, 1), (None, 3)])
 def test_pulses_before_and_behind_those_whose_speed_is_known_are_not_spurious(
         rng, from_rest, marks):
-    t = np.arange(round(20.0 * RATE)) / RATE
+    t = np.arange(round(12.0 * RATE)) / RATE
     turns = 25.0 * t if from_rest is None else 1.1 * np.clip(t - 1.8, 0.0, None) ** 2
     turns = turns[-1] - turns[::-1] if from_rest is False else turns
     places = np.arange(1.0, turns[-1] - 1.0)[:, None] + np.array([0.0, 0.1, 0.22])[:marks]

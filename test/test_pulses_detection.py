@@ -505,8 +505,8 @@ def in_bits(wave, rng, *, noise=0.25, volts=20.0 / 4096):
 
 
 @pytest.mark.parametrize(('speed', 'rate', 'turning', 'stopped'), [
-    (25.0, 10_000.0, 4.0, 3.0), (25.0, 10_000.0, 0.0, 4.5), (0.2, 5000.0, 60.0, 0.0),
-    (1.0, 5000.0, 20.0, 3.0)])
+    (25.0, 10_000.0, 4.0, 3.0), (25.0, 10_000.0, 0.0, 4.5), (0.2, 1000.0, 30.0, 0.0),
+    (1.0, 2000.0, 10.0, 3.0)])
 def test_the_last_bit_of_a_machine_that_stands_is_no_pulse(speed, rate, turning, stopped, rng):
     t = np.arange(round((2.0 * turning + stopped + 4.0) * rate)) / rate
     turns = 0.37 + speed * (np.minimum(t, turning) + np.clip(t - turning - stopped, 0.0, None))
