@@ -295,7 +295,7 @@ def test_orders_that_a_trigger_cycle_does_not_resolve_count_as_one(rng):
     for length, groups in ((1.0, 4), (0.9, 1), (1.0 / 3.0, 1), (2.0, 4)):
         evidence = evidence_of(rng, np.zeros((3, 5)))
         evidence = replace(evidence, model=replace(MODEL, ratio=length), lines=lines)
-        radial, noise = evidence.of_orders
+        radial, noise = evidence.of_orders(evidence.lines.radial)
         assert radial.shape == (3, 4, groups)
         assert noise == pytest.approx(np.full(groups, 0.01 / np.sqrt(4 / groups)))
 

@@ -17,6 +17,7 @@ import pytest
 from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
 from sa_jitter_ros.inference.gathering import (
     _Grid, _of_acquisitions, _of_centred, _runs, _slope, _uncertainty, _unskewed, dithered)
+from sa_jitter_ros.inference.observation import _in_parts
 
 PULSES, PERIOD, TICK, SKEW = 24, 0.025, 1e-4, 1e-3
 
@@ -104,3 +105,25 @@ def test_skew_is_taken_out_though_the_smoothest_motion_drifts(rng):
         true, items)
     slope = _slope(_runs(items, left))
     assert abs(slope) * np.ptp(times) < 0.05 * TICK
+
+
+@pytest.mark.parametrize('points', [400, 61, 9])
+def test_amplitudes_in_parts_of_cycles_are_of_one_order_each(points):
+    """A gain that is faster than the cycles shows, and no other declared order, of any length."""
+    turns, count = np.array([0.8, 2.3]) if points < 20 else np.array([3.6, 11.3]), 60
+    angle = np.arange(count * points) / points
+    gain = 1.0 + 0.1 * np.cos(2.0 * np.pi * 0.37 * angle)
+    waves = np.exp(2j * np.pi * angle[:, None] * turns) * np.exp([0.3j, 1.1j]) * (1.0, 0.5)
+    waves[:, 0] *= gain
+    of_cycles = np.stack([gain.reshape(count, points).mean(axis=1) * np.exp(0.3j),
+                          np.full(count, 0.5 * np.exp(1.1j))], axis=1)
+    found = _in_parts(waves.real.sum(axis=1).reshape(count, points, 1), of_cycles[:, None], turns)
+    parts = min(points, 16)
+    middles = (np.arange(count * parts) + 0.5) / parts
+    assert found.shape == (count * parts, 1, 2)
+    if points > 20:
+        expected = 1.0 + 0.1 * np.cos(2.0 * np.pi * 0.37 * middles)
+        slow = np.convolve(found[:, 0, 0], np.ones(parts) / parts, 'valid')
+        np.testing.assert_allclose(
+            slow, np.convolve(expected, np.ones(parts) / parts, 'valid'), atol=0.02)
+    assert np.std(found[:, 0, 1]) < 0.06

@@ -97,7 +97,7 @@ class AmplitudeModulation(DirectEffect):
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
         """Return the modulation that the amplitudes of the orders together allow."""
-        radial, noise = evidence.of_orders
+        radial, noise = evidence.of_orders(evidence.lines.radial)
         if not noise.size:
             return None
         if noise.size == 1:  # all that it scatters may be a modulation
@@ -115,7 +115,7 @@ class AmplitudeModulation(DirectEffect):
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit what is common to the amplitudes of all orders, cycle by cycle."""
-        radial, noise = evidence.of_orders
+        radial, noise = evidence.of_orders(evidence.lines.radial)
         if not noise.size:
             return absent(cls.name, 'no line is compared')
         beside = evidence.lines.order.max() + 0.5 / evidence.model.cycle_length
@@ -125,7 +125,9 @@ class AmplitudeModulation(DirectEffect):
         found = fit_common_gain(radial, noise)
         if not found.powers.any():
             return absent(cls.name, 'the one order that is compared scatters as noise does')
-        (std, std_error), (bandwidth, bandwidth_error) = found.size_and_width()
+        whole = evidence.lines.with_sources
+        of_size = found if whole is None else fit_common_gain(*evidence.of_orders(whole))
+        (std, std_error), (bandwidth, bandwidth_error) = of_size.size_and_width()
         text = f'the amplitudes of all lines grow and shrink together by {std:.2%}'
         return weighed(Finding(
             cls.name, cls(min(std, 1.0), bandwidth),

@@ -73,7 +73,8 @@ class LineEvidence:
     amplitude over `level`, less 1, and `radial_noise` (line,) its standard deviation by noise
     alone. `tone` is what stands out most between the synchronous lines, `hidden_tone` the largest
     amplitude that would not, with its standard error; `beat` is the beat of an interpolator, which
-    `radial` is without.
+    `radial` is without. `with_sources` is as `radial`, with what undeclared sources beside the
+    orders make of it: the fastest part of a modulation passes for them.
     """
 
     order: Array
@@ -85,6 +86,7 @@ class LineEvidence:
     tone: Tone | None = None
     hidden_tone: tuple[float, float] = (0.0, math.inf)
     beat: Beat = Beat()
+    with_sources: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,7 @@ class Evidence:
         """Return the number of trigger cycles that the lines were measured in."""
         return int(np.prod(self.lines.radial.shape[:2]))
 
-    @property
-    def of_orders(self) -> tuple[Array, Array]:
+    def of_orders(self, radial: Array) -> tuple[Array, Array]:
         """
         Return `radial` (acquisition, cycle, group) and its noise (group,) of lines that differ.
 
@@ -143,7 +144,7 @@ class Evidence:
         weight = (group[:, None] == np.unique(group)) / np.maximum(
             lines.radial_noise, 1e-9)[:, None] ** 2
         information = weight.sum(axis=0)
-        return lines.radial @ (weight / information), 1.0 / np.sqrt(information)
+        return radial @ (weight / information), 1.0 / np.sqrt(information)
 
     @property
     def times(self) -> Array:

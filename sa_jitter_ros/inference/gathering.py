@@ -246,6 +246,8 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
         record_times=observation.pulses.times, record_missing=observation.pulses.lost,
         clock=clock, explained=tuple(effects),
         lines=replace(scatter, radial=scatter.radial[list(usable)],
+                      with_sources=None if scatter.with_sources is None else
+                      scatter.with_sources[list(usable)],
                       noise_density=scatter.noise_density[list(usable)]))
 
 
@@ -267,17 +269,18 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     shortest = cycles.shape[1]
     mean = cycles.mean(axis=1, keepdims=True)
     level = np.abs(mean).mean(axis=(0, 1))
-    tone = _tone(observation, lines)
-    relative = cycles * np.exp(-1j * np.angle(mean)) / level - 1.0
+    tone, items = _tone(observation, lines), observation.acquisitions
+    along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
+    whole = lines.of(np.array([
+        item.parts.reshape(len(item.cycles), -1, *item.parts.shape[1:]).mean(axis=1)[:shortest]
+        for item in items])) / level - 1.0
     if tone is not None:  # what it makes is no modulation
-        relative -= _beside(observation, lines, tone, relative)
-    along = relative.real
+        along, whole = (item - _beside(observation, lines, tone, item) for item in (along, whole))
     noises = np.array([radial_noise(row) for row in cycles])
     noise = np.sqrt(np.mean(noises**2, axis=0))
     floor = lines.of(observation.stacked('noise_floor'))
     density = floor * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
     order = observation.orders[lines.order]
-    items = observation.acquisitions
     steady = lines.of(np.concatenate([item.parts for item in items]))  # what turns it is no beat
     beat = find_beat(
         steady / level, np.concatenate([item.middles(len(item.parts)) for item in items]), order,
@@ -285,23 +288,24 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     times = np.array([item.middles(len(item.cycles))[:shortest] for item in items])
     return LineEvidence(
         order=order, channel=lines.channel, level=level, noise_density=density,
-        radial=without_beat(along.reshape(-1, order.size), times.ravel(), beat
-                            ).reshape(along.shape),
+        **{name: without_beat(item.reshape(-1, order.size), times.ravel(), beat
+                              ).reshape(item.shape)
+           for name, item in (('radial', along), ('with_sources', whole))},
         radial_noise=noise * np.sqrt(shortest) / level, tone=tone,
         hidden_tone=_hidden_tone(observation, density), beat=beat)
 
 
-def _beside(observation: Observation, lines: Lines, tone: Tone, relative: Array) -> Array:
-    """Return what of `relative` amplitudes (acquisition, cycle, line), less 1, a tone makes."""
+def _beside(observation: Observation, lines: Lines, tone: Tone, along: Array) -> Array:
+    """Return what of amplitudes `along` (acquisition, cycle, line), less 1, a tone makes."""
     order = observation.orders[lines.order]
-    places = np.arange(relative.shape[1]) + 0.5  # middles of cycles
+    places = np.arange(along.shape[1]) + 0.5  # middles of cycles
     times = np.array([item.middles(len(item.cycles))[:places.size]
                       for item in observation.acquisitions])
     angle = observation.model.cycle_length * np.array(
         [observation.pulses.number[item.first] + places for item in observation.acquisitions])
     turns = tone.frequency * times[..., None] - angle[..., None] * order
     wave = np.exp(2j * np.pi * turns)
-    return np.asarray(np.mean(relative * wave.conj(), axis=(0, 1)) * wave)
+    return np.asarray(2.0 * (np.mean(along * wave.conj(), axis=(0, 1)) * wave).real)
 
 
 def _tone(observation: Observation, lines: Lines) -> Tone | None:
