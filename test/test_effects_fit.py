@@ -290,6 +290,28 @@ def test_one_order_at_the_end_of_the_band_tells_no_modulation_from_its_noise(rng
     assert (finding.effect is not None) == found
 
 
+def test_a_modulation_has_the_size_that_shows_with_what_stands_beside_the_orders(rng):
+    """Its fastest part passes for undeclared sources; they alone are none."""
+    fast = stationary(rng, flat_band_correlation(LAGS, (0.0, 0.4)) + 1e-9 * (LAGS == 0), 24)
+    gain = 0.05 * fast[:, :-1, None]
+    noise = rng.normal(0.0, 0.01, (24, PULSES - 1, 4))
+    evidence = evidence_of(rng, declared(rng)[:24], radial=0.5 * gain + noise)
+
+    def found(evidence, **lines):
+        return EFFECTS['amplitude_modulation'].fit(replace(
+            evidence, lines=replace(evidence.lines, **lines)))
+
+    assert found(evidence, with_sources=gain + noise).effect.std == pytest.approx(0.05, rel=0.1)
+    assert found(evidence).effect.std == pytest.approx(0.025, rel=0.1)
+    assert found(evidence, radial=noise, with_sources=gain + noise).effect is None
+    one = {'order': np.full(4, 8.0), 'channel': np.arange(4)}
+    slow = 0.05 * stationary(rng, flat_band_correlation(LAGS, (0.0, 0.1)) + 1e-9 * (LAGS == 0),
+                             24)[:, :-1, None] + noise
+    sizes = [found(evidence, radial=slow, with_sources=whole, **one).effect.std
+             for whole in (None, noise - np.roll(noise, 1, axis=1))]
+    assert sizes[0] == sizes[1] > 0.0
+
+
 def test_orders_that_a_trigger_cycle_does_not_resolve_count_as_one(rng):
     lines = evidence_of(rng, np.zeros((3, 5))).lines
     for length, groups in ((1.0, 4), (0.9, 1), (1.0 / 3.0, 1), (2.0, 4)):

@@ -127,6 +127,7 @@ class AmplitudeModulation(DirectEffect):
             return absent(cls.name, 'the one order that is compared scatters as noise does')
         whole = evidence.lines.with_sources
         of_size = found if whole is None else fit_common_gain(*evidence.of_orders(whole))
+        of_size = of_size if of_size.powers.any() else found
         (std, std_error), (bandwidth, bandwidth_error) = of_size.size_and_width()
         text = f'the amplitudes of all lines grow and shrink together by {std:.2%}'
         return weighed(Finding(
