@@ -14,6 +14,7 @@ from fractions import Fraction
 from functools import lru_cache
 import math
 import tracemalloc
+from types import SimpleNamespace
 
 from hypothesis import given, settings, strategies as st
 from machine import averager, feed, Machine
@@ -891,3 +892,15 @@ def test_marks_are_known_by_the_vibration_only_as_far_as_their_errors_show_them(
         found = seen.added_to(even, np.arange(4))
         assert found.by_vibration == known
         np.testing.assert_allclose(found.angles, late, rtol=1e-3)
+
+
+def test_an_average_whose_pulses_none_was_taken_from_teaches_no_marks():
+    """As behind a change of the wheel: the average before had all that were remembered."""
+    seen = RecoveredMarks(2)
+    seen._pulses.append((np.arange(4.0), np.array([0, 1, 0, 1]), np.full(4, 0.1), np.zeros(4)))
+    for end in (10.0, 20.0):
+        seen.learn(SimpleNamespace(
+            end_time=end, pulses=np.arange(4.0) + end, correction=SimpleNamespace(
+                accepted=True, pulse_errors=np.full(4, 1e-3), standard_errors=np.full(4, 1e-4))))
+    even = MarkOffsets(*np.zeros((2, 2)))
+    assert seen.added_to(even, np.arange(2)) is even

@@ -82,6 +82,8 @@ class RecoveredMarks:
         times, marks, pace, taken = (np.concatenate(item) for item in zip(*self._pulses))
         last = int(np.searchsorted(times, average.end_time))
         self._pulses = deque([(times[last:], marks[last:], pace[last:], taken[last:])])
+        if not times.size:  # all were in the average before
+            return
         place = np.minimum(np.searchsorted(times, average.pulses), times.size - 1)
         chosen = ((times[place] == average.pulses) & np.isfinite(correction.pulse_errors)
                   & (correction.standard_errors > 0.0))
