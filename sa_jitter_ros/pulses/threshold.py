@@ -55,10 +55,9 @@ _LOBES, _RESTS, _NEAR, _LOBE, _JOINED = 0.25, 0.4, 0.15, 0.5, 2.0
 _GAPS = 2.0  # the pause where teeth are missing over others, and that between lobes of one
 # A waveform that is so often near one of its levels is no hum: a sine is in 41 % of its samples.
 _AT_LEVELS, _CLOSE = 0.6, 0.1
-# Runs of samples in the rarer state that may be of noise: their mean length, and samples beside
-# the first ones of all; and their length where levels are so few steps of the samples apart that
-# they may be a converter's last bit.
-_SINGLE, _MORE, _LONG, _STEPS = 1.9, 8, 2.5, 2.5
+# Mean length of the runs of samples in the rarer state that noise may have; and levels that are so
+# few steps of the samples apart may be a converter's last bit.
+_LONG, _STEPS = 2.5, 2.5
 # Samples of an edge that are kept at most, and how often a line is fitted to those in the band.
 _LONGEST, _ROUNDS = 1 << 16, 3
 _SECOND = 0.6745 * math.sqrt(6.0)  # median of second differences of white noise of size 1
@@ -192,9 +191,7 @@ def _changes_as_pulses(levels: StateLevels, samples: FloatArray, *, coarse: bool
     begin, end = _runs(above if 2 * np.count_nonzero(above) < above.size else ~above)
     if _regular(begin, 0.5 * _EVEN if coarse else _EVEN):
         return True
-    length = end - begin
-    return bool(np.mean(length) > (_LONG if coarse else _SINGLE)
-                and (coarse or np.sum(length - 1) >= _MORE))
+    return bool(np.mean(end - begin) > _LONG)
 
 
 def _noise(samples: FloatArray) -> float:
