@@ -274,8 +274,11 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     whole = lines.of(np.array([
         item.parts.reshape(len(item.cycles), -1, *item.parts.shape[1:]).mean(axis=1)[:shortest]
         for item in items])) / level - 1.0
+    times = np.array([item.middles(len(item.cycles))[:shortest] for item in items])
     if tone is not None:  # what it makes is no modulation
-        along, whole = (item - _beside(observation, lines, tone, item) for item in (along, whole))
+        wave = _beside(observation, lines, tone, times)
+        along, whole = (item - 2.0 * (np.mean(item * wave.conj(), axis=(0, 1)) * wave).real
+                        for item in (along, whole))
     noises = np.array([radial_noise(row) for row in cycles])
     noise = np.sqrt(np.mean(noises**2, axis=0))
     floor = lines.of(observation.stacked('noise_floor'))
@@ -285,7 +288,6 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     beat = find_beat(
         steady / level, np.concatenate([item.middles(len(item.parts)) for item in items]), order,
         order * model.fundamental_frequency / observation.sample_rate)
-    times = np.array([item.middles(len(item.cycles))[:shortest] for item in items])
     return LineEvidence(
         order=order, channel=lines.channel, level=level, noise_density=density,
         **{name: without_beat(item.reshape(-1, order.size), times.ravel(), beat
@@ -295,17 +297,14 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
         hidden_tone=_hidden_tone(observation, density), beat=beat)
 
 
-def _beside(observation: Observation, lines: Lines, tone: Tone, along: Array) -> Array:
-    """Return what of amplitudes `along` (acquisition, cycle, line), less 1, a tone makes."""
-    order = observation.orders[lines.order]
-    places = np.arange(along.shape[1]) + 0.5  # middles of cycles
-    times = np.array([item.middles(len(item.cycles))[:places.size]
-                      for item in observation.acquisitions])
+def _beside(observation: Observation, lines: Lines, tone: Tone, times: Array) -> Array:
+    """Return the wave (acquisition, cycle, line) of a tone beside lines at `times` in s."""
+    places = np.arange(times.shape[1]) + 0.5  # middles of cycles
     angle = observation.model.cycle_length * np.array(
         [observation.pulses.number[item.first] + places for item in observation.acquisitions])
-    turns = tone.frequency * times[..., None] - angle[..., None] * order
-    wave = np.exp(2j * np.pi * turns)
-    return np.asarray(2.0 * (np.mean(along * wave.conj(), axis=(0, 1)) * wave).real)
+    turns = tone.frequency * times[..., None] - (
+        angle[..., None] * observation.orders[lines.order])
+    return np.asarray(np.exp(2j * np.pi * turns))
 
 
 def _tone(observation: Observation, lines: Lines) -> Tone | None:
