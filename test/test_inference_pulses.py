@@ -287,6 +287,6 @@ def test_too_few_trigger_cycles_are_named(cycles):
 def test_order_that_is_not_compared_is_named():
     content = report(traced(simulated(), replace(MODEL, orders=(8.0, 13.0, 16.0))))
     assert {item['order'] for item in content['lines']} == {8.0, 16.0}
-    assert any(text.startswith('order 13 is declared but not compared')
+    assert any(text.startswith('declared, but not compared: order 13')
                for text in content['remarks'])
     assert 'order 13' in summary(content)

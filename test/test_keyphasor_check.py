@@ -194,6 +194,16 @@ def test_target_that_changes_is_named(rng):
     assert 'pattern_changes' in codes(check)
 
 
+def test_target_whose_gap_is_elsewhere_later_is_named(rng):
+    early, late = (tach(rng, 12, missing=missing)[0] for missing in ((3, 8), (4, 8)))
+    middle = 0.5 * SECONDS
+    check = checked(np.full((1, 1), np.nan), np.append(early[early < middle],
+                                                       late[late > middle]), rate=1.0)
+    text = next(item.text for item in check.warnings if item.code == 'pattern_changes')
+    assert '12 teeth, 2 of them missing before' in text
+    assert '12 teeth, 2 of them missing elsewhere behind' in text
+
+
 def test_standstill_costs_nothing_else(rng):
     times = tach(rng, 12, missing=(11,))[0]
     check = checked(np.full((1, 1), np.nan), times[(times < 3.0) | (times > 6.0)], rate=1.0)

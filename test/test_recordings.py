@@ -425,6 +425,12 @@ def test_mat_with_a_struct_for_vibration(tmp_path):
         read(tmp_path / 'bad.mat')
 
 
+def test_mat_with_complex_samples(tmp_path):
+    scipy.io.savemat(tmp_path / 'bad.mat', {'vibration': np.ones((1, 9)) * 1j, 'sample_rate': 1.0})
+    with pytest.raises(RecordingError, match='vibration is complex: give real numbers'):
+        read(tmp_path / 'bad.mat')
+
+
 @pytest.mark.parametrize('limit', [1000, 1 << 26], ids=['mapped', 'memory'])
 @pytest.mark.parametrize('compress', [False, True])
 def test_mat_with_structs_in_structs(rng, tmp_path, monkeypatch, compress, limit):
@@ -702,6 +708,10 @@ STRANGE = {  # line of names, fields of a row, delimiter, coding, remarks; start
                        1.0),
     'groups in quotes': ('t,a,b', lambda t, *row: (t, *(f'"{grouped(x)}"' for x in row)), ',',
                          0.0, 1e3),
+    'commas in quotes': ('"t","a","b"', lambda *row: (
+        f'"{x.replace(".", ",")}"' for x in row), ',', 0.0, 1.0),
+    'groups in quotes, comma behind': ('t,a,b', lambda t, *row: (
+        t, *(f'"{grouped(x, ".,")}"' for x in row)), ',', 0.0, 1e3),
     'groups by points': ('t;a;b', lambda t, *row: (
         t.replace('.', ','), *(grouped(x, '.,') for x in row)), ';', 0.0, 1e3),
     'groups by apostrophes': ('t;a;b', lambda t, *row: (

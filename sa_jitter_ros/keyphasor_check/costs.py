@@ -200,10 +200,9 @@ def _of_changes(times: FloatArray) -> list[Warn]:
     names = ['even marks' if item is None else f'{item.teeth} teeth, {item.teeth - item.present} '
              'of them missing' for item in best]
     return [Warn(
-        'pattern_changes', f'the target looks like {names[0]} before '
-        f'{times[half]:.6g} s, '
-        f'and like {names[1]} behind it: check whether two recordings were joined, or a mark came '
-        'off')]
+        'pattern_changes', f'the target looks like {names[0]} before {times[half]:.6g} s, and '
+        f'like {names[1]}{" elsewhere" * (names[0] == names[1])} behind it: check whether two '
+        'recordings were joined, or a mark came off')]
 
 
 def _percent(orders: Sequence[float], loss: Sequence[float]) -> tuple[tuple[float, float], ...]:

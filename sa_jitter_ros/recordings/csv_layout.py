@@ -13,9 +13,9 @@ What the lines of a `.csv` file are: a preamble, names, units, and rows of sampl
 
 The structure tells, not the make of the instrument. Rows of samples have numbers in the same
 columns all along; above them are the names, below these the units, or none of both, and above all
-that a preamble. Fields are separated by comma, semicolon, tab or spaces; but for the first, a
-comma is a decimal point. Clock times count from midnight, whatever their date. A column that
-counts the rows is none of samples.
+that a preamble. Fields are separated by comma, semicolon, tab or spaces; but for the first, and in
+quotes, a comma is a decimal point. Clock times count from midnight, whatever their date. A column
+that counts the rows is none of samples.
 """
 
 from collections import Counter
@@ -54,7 +54,7 @@ _IN_NAME = re.compile(r'^(.*?)(?:\s*[\[(]([^\])]*)[\])]|(?:^|,?\s)in\s+(\S+)|'
 # A date that is not read, hours, minutes, seconds, time zone.
 _CLOCK = re.compile(r'(?:\S*\d[T ])?(?:(\d+):)?(\d+):(\d+(?:\.\d*)?)(?:Z|[-+]\d\d:?\d\d)?')
 # Groups of three digits are told from decimals by the decimals behind them.
-_QUOTED = re.compile('"[^"]*"')
+_QUOTED, _LINE = re.compile(r'"[-+\d.,\'\seE]*"'), re.compile('.+')  # with numbers
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,'\s])\d{3}(?:\1\d{3})*(?!\1)[.,]\d+")
 _RATE_WORDS = re.compile(r'interval|increment|period|resolution|rate|dt\b', re.IGNORECASE)
 _NUMBER = re.compile(r'(?<!\w)[-+.]?\d')
@@ -114,10 +114,9 @@ class CsvLayout:
 
     def plain(self, line: str) -> str:
         """Return a line with decimal points and without groups of digits."""
-        if self.delimiter != ',':
-            return line.replace(self._thousands, '').replace(',', '.')
-        return line if not self._thousands else _QUOTED.sub(
-            lambda found: found[0].replace(self._thousands, ''), line)
+        numbers = _QUOTED if self.delimiter == ',' else _LINE
+        return numbers.sub(
+            lambda found: found[0].replace(self._thousands, '').replace(',', '.'), line)
 
     def has_number(self, line: str, column: int) -> bool:
         """Return whether a row has a number in a column."""

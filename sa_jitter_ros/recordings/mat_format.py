@@ -194,7 +194,7 @@ class _Reader:
             at = self._after(places[-1], at)
         flags, dims, name = places
         flag = struct.unpack_from(f'{self._order}I', data, flags.start)[0]
-        kind = 0 if flag & _COMPLEX else flag & 0xFF
+        kind = 0 if flag & _COMPLEX else flag & 0xFF  # 0 is none of the format's classes
         if kind == _OPAQUE:  # an object, as a table or a datetime: its name follows the flags
             return _Matrix(data[dims.start:dims.stop].decode('ascii', 'replace'), kind, (1, 1),
                            element.stop, element.stop)
@@ -214,8 +214,8 @@ class _Reader:
         if matrix.kind == _CHAR:
             return self._text(data, matrix)
         if matrix.kind not in _NUMERIC:
-            raise RecordingError(f'{matrix.name} has class {matrix.kind}: give real '
-                                 'numbers or text')
+            what = f'has class {matrix.kind}' if matrix.kind else 'is complex'
+            raise RecordingError(f'{matrix.name} {what}: give real numbers or text')
         part = self._element(data, matrix.content, matrix.stop)
         dtype = np.dtype(self._order + _NUMBERS[part.kind])
         count = prod(matrix.shape)

@@ -175,7 +175,7 @@ def _not_compared(trace: Trace) -> Sequence[str]:
     orders = trace.observation.orders
     without = np.setdiff1d(np.arange(orders.size), trace.lines.order)
     names = ', '.join(trace.observation.words(order) for order in orders[without])
-    return [f'{names} is declared but not compared: on no channel is its phase as constant from '
+    return [f'declared, but not compared: {names}; the phase is on no channel as constant from '
             'cycle to cycle as that of the other lines'] * bool(names)
 
 
