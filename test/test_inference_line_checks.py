@@ -10,6 +10,8 @@
 
 """Whether all lines move together: what a changing speed does to them, and what a path does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sa_jitter_ros.effects.evidence import LineEvidence
@@ -96,6 +98,22 @@ def test_gain_of_single_events_is_no_modulation(rng, event):
         np.array([20.0, 40.0]), np.zeros(2, int), np.ones(2), np.ones((acquisitions, 2)),
         radial.reshape(acquisitions, cycles, 2), np.array([0.02, 0.02])))
     assert (found.p_value < 1e-6) == (event != 'none')
+
+
+@pytest.mark.parametrize('left_out', [2, 40])
+def test_gain_that_went_on_between_acquisitions_is_no_single_event(rng, left_out):
+    acquisitions, cycles = 24, 18
+    number = np.add.outer(2 * cycles * np.arange(acquisitions), np.arange(cycles))
+    place = np.add.outer((cycles + left_out) * np.arange(acquisitions), np.arange(cycles))
+    count = (cycles + left_out) * acquisitions
+    waves = np.fft.rfft(rng.standard_normal(count))
+    gain = np.fft.irfft(np.where(np.arange(waves.size) < 0.02 * count, waves, 0.0), count)
+    radial = 0.2 * (gain / gain.std())[place, None] + 0.005 * rng.standard_normal(
+        (acquisitions, cycles, 1))
+    lines = LineEvidence(np.array([20.0]), np.zeros(1, int), np.ones(1),
+                         np.ones((acquisitions, 1)), radial, np.array([0.005]))
+    assert check_gain(lines).p_value < 1e-6  # jumps, as if the cycles were neighbours
+    assert check_gain(replace(lines, number=number)).p_value > 0.01
 
 
 @pytest.mark.parametrize('drifting', [False, True])

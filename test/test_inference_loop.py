@@ -277,6 +277,25 @@ def test_effect_of_no_module_stays_unexplained():
 
 
 @pytest.mark.machines
+def test_missing_pulses_hide_no_modulation():
+    effects = make_effects({'amplitude_modulation': {'std': 0.2, 'bandwidth': 0.03},
+                            'missing_pulses': {'probability': 0.015}})
+    found = traced(*effects, acquisitions=16)
+    assert {item.name for item in found.findings} == {'amplitude_modulation', 'missing_pulses'}
+
+
+@pytest.mark.machines
+def test_missing_pulses_leave_the_other_cycles_of_an_average_corrected():
+    effects = make_effects({'speed_fluctuation': {'acceleration_std': 220.0},
+                            'missing_pulses': {'probability': 0.015}})
+    (found,), _ = observed(*effects, acquisitions=16)
+    beside = [item for item in found.acquisitions if item.missing.any()]
+    assert len(beside) > 2
+    for item in beside:
+        np.testing.assert_allclose(np.abs(item.corrected[0]), [1.0, 0.8, 0.6, 0.5], rtol=0.02)
+
+
+@pytest.mark.machines
 def test_torsion_is_a_speed_that_fluctuates():
     """The sidebands that it makes beside every line are bends of the speed."""
     order = 0.2

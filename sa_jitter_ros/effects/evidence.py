@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.arrays import Array, IntArray
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.influence import (
@@ -74,7 +74,8 @@ class LineEvidence:
     alone. `tone` is what stands out most between the synchronous lines, `hidden_tone` the largest
     amplitude that would not, with its standard error; `beat` is the beat of an interpolator, which
     `radial` is without. `with_sources` is as `radial`, with what undeclared sources beside the
-    orders make of it: the fastest part of a modulation passes for them.
+    orders make of it: the fastest part of a modulation passes for them. `number` (acquisition,
+    cycle) counts the cycles; some are left out where those of acquisitions do not follow.
     """
 
     order: Array
@@ -87,6 +88,7 @@ class LineEvidence:
     hidden_tone: tuple[float, float] = (0.0, math.inf)
     beat: Beat = Beat()
     with_sources: Array | None = None
+    number: IntArray | None = None
 
 
 @dataclass(frozen=True)

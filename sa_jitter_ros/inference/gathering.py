@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import math
 
 import numpy as np
-from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.arrays import Array, IntArray
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
@@ -294,7 +294,15 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
                               ).reshape(item.shape)
            for name, item in (('radial', along), ('with_sources', whole))},
         radial_noise=noise * np.sqrt(shortest) / level, tone=tone,
-        hidden_tone=_hidden_tone(observation, density), beat=beat)
+        hidden_tone=_hidden_tone(observation, density), beat=beat,
+        number=_numbers(observation, shortest))
+
+
+def _numbers(observation: Observation, cycles: int) -> IntArray:
+    """Return numbers (acquisition, cycle) of so many cycles each; as many are left out at gaps."""
+    begin = observation.pulses.number[[item.first for item in observation.acquisitions]]
+    apart = np.cumsum(np.diff(begin, prepend=begin[0] - cycles) != cycles)
+    return np.asarray(np.add.outer(cycles * (np.arange(begin.size) + apart), np.arange(cycles)))
 
 
 def _beside(observation: Observation, lines: Lines, tone: Tone, times: Array) -> Array:

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 import math
 
 import numpy as np
-from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.arrays import Array, IntArray
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
@@ -44,12 +44,18 @@ def check_gain(lines: LineEvidence) -> Check:
     Whitened, a step or a loss of signal for a while stands out, and noise in a band does not.
     """
     weight = lines.radial_noise**-2.0
-    gain = (lines.radial @ (weight / weight.sum())).ravel()
-    waves = np.fft.rfft((gain - gain.mean()) * taper(gain.size))
-    drawn = np.random.default_rng(SEED).standard_normal((DRAWS, gain.size))
-    like = np.fft.irfft(np.fft.rfft(drawn) * np.sqrt(_smooth(waves)), gain.size)
-    found, null = (_tails(item, gain.size) for item in (
-        waves, np.fft.rfft(like * taper(gain.size))))
+    # less sources, an acquisition has other amplitudes at its ends
+    radial = lines.radial if lines.with_sources is None else lines.with_sources
+    gain = (radial @ (weight / weight.sum())).ravel()
+    number = np.arange(gain.size) if lines.number is None else lines.number.ravel()
+    every = np.interp(np.arange(number[-1] + 1), number, gain)
+    # a gap makes kinks beside it
+    inside = number[1:-1][number[2:] - number[:-2] == 2]
+    waves = np.fft.rfft((every - every.mean()) * taper(every.size))
+    drawn = np.random.default_rng(SEED).standard_normal((DRAWS, every.size))
+    like = np.fft.irfft(np.fft.rfft(drawn) * np.sqrt(_smooth(waves)), every.size)
+    found, null = (_tails(item, every.size, inside) for item in (
+        waves, np.fft.rfft(like * taper(every.size))))
     p_value = chance(float(found), null) if found > _EVENTS else 1.0
     return Check(p_value, LINES, float(np.std(gain)),
                  'the amplitudes grow and shrink together by single events, as steps or losses of '
@@ -86,10 +92,11 @@ def _smooth(waves: Array) -> Array:
     return np.asarray((power[..., high] - power[..., low]) / (high - low))
 
 
-def _tails(waves: Array, count: int) -> Array:
-    """Return the kurtosis of series (..., time), their power made alike at all frequencies."""
+def _tails(waves: Array, count: int, inside: IntArray) -> Array:
+    """Return the kurtosis of series (..., time) `inside`, with power alike at all frequencies."""
     ends = math.ceil(TAPER * count)
-    white = np.fft.irfft(waves / np.sqrt(_smooth(waves)), count)[..., ends:-ends]
+    inside = inside[(inside >= ends) & (inside < count - ends)]
+    white = np.fft.irfft(waves / np.sqrt(_smooth(waves)), count)[..., inside]
     return np.asarray(np.mean(white**4, axis=-1) / np.mean(white**2, axis=-1) ** 2)
 
 

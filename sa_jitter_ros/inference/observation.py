@@ -125,8 +125,10 @@ class Acquisition:
 
     @cached_property
     def corrected(self) -> ComplexArray:
-        """Return the corrected complex peak amplitudes (channel, order)."""
-        return np.asarray(self.cycles.mean(axis=0))
+        """Return the corrected complex peak amplitudes (channel, order) of whole cycles."""
+        some = self.missing.any() and not self.missing.all()
+        whole = np.repeat(self.missing == 0, 1 + self.missing) if some else ...
+        return np.asarray(self.cycles[whole].mean(axis=0))
 
     @property
     def attenuation(self) -> FloatArray:
@@ -387,7 +389,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     late = recovery.bridged_errors[span]
     late = late - late[measured].mean() * common_turn(bridged - late, measured)
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
-    ripple = recovery.ripple[span.start + measured[:-1]]
+    ripple = recovery.ripple[span.start:span.stop - 1]
     # asked of all cycles: of one acquisition, chance would choose which is compared
     resolved = recovery.ripple_resolved and bool(np.isfinite(ripple).all())
     reason = _unresolved(bridged - late, standard_errors, recovery, model, resolved)
@@ -415,7 +417,8 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
         radial_noise(clean_cycles), floor, _in_parts(
             grid, clean_cycles[..., :len(declared)], model.cycle_length * declared),
-        ripple, recovery.ripple_standard_error, not reason, reason)
+        np.where(missing > 0, np.nan, ripple[measured[:-1]]), recovery.ripple_standard_error,
+        not reason, reason)
 
 
 def _in_parts(grid: FloatArray, cycles: ComplexArray, turns: FloatArray) -> FloatArray:

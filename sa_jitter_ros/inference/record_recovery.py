@@ -55,7 +55,7 @@ class RecordRecovery:
     `errors` and `standard_errors` (n,) in s are measured minus true, with
     mean 0 in each stretch, NaN outside of them; `bridged_errors` and `bridged_standard_errors`
     (m,) have those of the interpolated pulses, too. `ripple` (m - 1,) is the factor of u (1 - u)
-    in the error inside a cycle (s), NaN beside a missing pulse, with its standard error.
+    in the error inside a cycle (s), with its standard error, not seen beside a missing pulse.
     `roughness` (s) is the RMS of what second differences of
     `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
     tones (Hz) that were fitted beside the declared ones. `fits` are those of the `stretches` of
@@ -236,7 +236,6 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
         if fit is not None:
             errors[stretch], standard_errors[stretch] = fit.errors, fit.standard_errors
             ripple[stretch.start:stretch.stop - 1] = fit.bends[:, 0]
-    ripple[~(pulses.measured[:-1] & pulses.measured[1:])] = np.nan
     ripple_error = float(np.sqrt(np.mean([fit.bend_standard_errors[0] ** 2 for fit in good]))
                          ) if good else np.inf
     if not np.isfinite(ripple_error):

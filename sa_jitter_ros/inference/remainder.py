@@ -10,7 +10,7 @@
 
 """What no effect explains, and which effects only absorb a part of it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,9 +115,7 @@ def unexplained_check(bench: Bench, timing: Timing | None, chosen: Sequence[Find
     speeds = model.trigger_revolutions / bench.observation.periods
     explained = np.mean([line_variance(replace(model, trigger_speed=speed), effects)
                          for speed in speeds.tolist()], axis=0)
-    of_lines = check_lines(bench.observation, bench.lines, explained)
-    if _GAIN in names:
-        of_lines = (*of_lines, check_gain(bench.scatter), check_channels(bench.scatter))
+    of_lines = (*check_lines(bench.observation, bench.lines, explained), *_of_gain(bench, names))
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
     left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
         check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
@@ -135,11 +133,14 @@ def surest_text(left: Check | None, scores: Scores, unsteady: Sequence[UnsteadyL
 
 def single_events(bench: Bench, found: Sequence[Finding]) -> Check | None:
     """Return what shows that a modulation that was found is a change of single events, or None."""
-    if _GAIN not in {item.name for item in found}:
-        return None
-    checks = [check_gain(bench.scatter), check_channels(bench.scatter)]
-    surest = min(checks, key=lambda item: item.p_value)
-    return surest if surest.p_value < FALSE_ALARM / len(checks) else None
+    checks = _of_gain(bench, {item.name for item in found})
+    return min((item for item in checks if item.p_value < FALSE_ALARM / len(checks)),
+               key=lambda item: item.p_value, default=None)
+
+
+def _of_gain(bench: Bench, names: Collection[str]) -> Sequence[Check]:
+    """Return the checks of a modulation, if it is one of the `names`."""
+    return (check_gain(bench.scatter), check_channels(bench.scatter)) if _GAIN in names else ()
 
 
 def unexplained_text(observation: Observation, most: str, harmful: Sequence[Finding],
