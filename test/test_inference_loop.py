@@ -382,6 +382,16 @@ def test_declared_clock_of_another_rate_is_named_though_measured_pulses_tell_the
 
 
 @pytest.mark.machines
+@pytest.mark.parametrize('declared', [2000.0, 6000.0])
+def test_clock_on_whose_ticks_the_pulses_lie_is_named_for_any_declared_rate(declared):
+    recording = with_slower_clock(simulated(jitter=False), 3017.3)
+    model = replace(MODEL, keyphasor_rate=declared)
+    found = trace([observe(recording, model)], [recording])
+    effect, = (item.effect for item in found.findings)
+    assert effect.clock_rate == pytest.approx(3017.3)
+
+
+@pytest.mark.machines
 @pytest.mark.parametrize(('near', 'where'), [(1e-3, 'declared_changes'), (0.03, 'present')])
 def test_declared_tone_that_is_not_there_is_named(near, where):
     tone = (1.0 + near) * MODEL.orders[0] * MODEL.fundamental_frequency
@@ -573,6 +583,13 @@ def test_added_jitter_and_slower_clock_make_the_old_pulses_the_reference():
     assert late.max() <= 1e-3
     with pytest.raises(ModelError, match='positive rate'):
         with_slower_clock(recording, 0.0)
+
+
+@pytest.mark.parametrize('count', [0, 1])
+def test_reference_without_pulses_is_refused(count):
+    recording = replace(simulated(acquisitions=2), reference_pulse_times=1.0 + np.zeros(count))
+    with pytest.raises(RecordingError, match='valid reference_pulse_times, at least 3 are needed'):
+        record_pulses(recording, MODEL)
 
 
 def test_missing_pulses_are_counted():

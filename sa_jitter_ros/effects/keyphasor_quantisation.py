@@ -84,10 +84,9 @@ class KeyphasorQuantisation(Effect):
         return pulses.errors
 
     def replaces_jitter(self, model: DeclaredModel) -> bool:
-        """Return whether this clock is the declared one, or a slower one read in its place."""
-        slower = self.clock_rate < model.keyphasor_rate and not (
-            model.jitter_std or model.jitter_distribution == 'table')
-        return slower or self.is_declared(model)
+        """Return whether this clock is the declared one, or is read in its place."""
+        other = model.jitter_std or model.jitter_distribution == 'table'
+        return not other or self.is_declared(model)
 
     def is_declared(self, model: DeclaredModel) -> bool:
         """Return whether this clock is the declared one."""

@@ -160,6 +160,9 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     itself = other is not None and np.array_equal(measured, other)
     if other is not None and not itself:
         better, _ = _validated(other, recording.duration)
+        if better.times.size < _FEWEST:
+            raise RecordingError(f'{better.times.size} valid reference_pulse_times, at least '
+                                 f'{_FEWEST} are needed: give those of all pulses, or none')
         # one pulse of the reference in each trigger cycle, or as many as there are of the other
         longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
         reference = _matched(found, better.every(1), step if longer**2 < step else 1)
