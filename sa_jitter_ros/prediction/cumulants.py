@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.arrays import Array, BoolArray
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import Empirical
@@ -29,7 +29,9 @@ _REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
 # Of tables, whose values do not smear what wide errors do, and their spreads in cycles.
 _TABLE_NODES, _SPREADS = (_NODES, 12, 24), (0.4, 0.75)
-_CLEAR = 8.0  # variance of a cycle over its squared mean
+# Variance of a cycle over its squared mean, up to which it is a mean to expand about: by errors of
+# any distribution, and by normal ones.
+_CLEAR, _CLEAR_NORMAL = 8.0, 1e6
 _MOST_BLOCKS = 64
 _PAIR_NODES = 32
 # Places in a cycle whose phasors superpose, and of all that meet; share of the variance forgotten.
@@ -81,17 +83,17 @@ def third_cumulants(orders: ArrayLike, processes: Sequence[AngleErrorProcess], t
     return unmixed, mixed
 
 
-def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Array, Array]:
+def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int, clear: BoolArray
+                         ) -> tuple[Array, Array]:
     """
     Return k(X, X, X) and k(X, X, conj X) as the pair moments of the cycles alone suggest.
 
     A triple moment is taken for the product of its three pair moments over its three means: exact
     for phasors of a Gaussian phase, and cheap where the memory is long. Long averages are summed
-    in blocks. 0 where the scatter of a cycle buries its mean and leaves nothing to expand about.
+    in blocks. 0 where the mean of a cycle is not `clear` (order,) enough to expand about.
     """
     require_cycles(trigger_cycles)
     size = np.abs(cycles.mean)
-    clear = np.real(cycles.variance[0]) < _CLEAR * size**2
     m, size = np.where(clear, cycles.mean, 1.0), np.where(clear, size, 1.0)
     block = math.ceil(trigger_cycles / _MOST_BLOCKS)
     count = round(trigger_cycles / block)
@@ -118,7 +120,7 @@ def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Arr
 
 
 def _superposed(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
-                cycles: CycleMoments) -> tuple[Array, Array]:
+                cycles: CycleMoments, clear: BoolArray) -> tuple[Array, Array]:
     """
     Return the same, of the phasors at places inside the cycles where the memory is not too long.
 
@@ -129,9 +131,8 @@ def _superposed(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigg
     known = np.abs(cycles.variance[:memory + 1])
     reach = int(np.flatnonzero(np.any(known >= _FORGOTTEN * known[0], axis=1))[-1])
     if (2 * reach + 1) * _INSIDE > _MOST_INSIDE:
-        return superposed_cumulants(cycles, trigger_cycles)
+        return superposed_cumulants(cycles, trigger_cycles, clear)
     g = require_orders(orders)
-    clear = np.real(cycles.variance[0]) < _CLEAR * np.abs(cycles.mean) ** 2
     u, w = unit_nodes(_INSIDE)
     mean = np.where(clear[:, None], joint_characteristic(
         processes, [g[:, None]], [u], [0]), 1.0)
@@ -191,24 +192,31 @@ def average_cumulants(orders: ArrayLike, processes: Sequence[AngleErrorProcess],
         return _integrated(orders, processes, trigger_cycles, cycles)
     gains = [process for process in processes if hasattr(process, 'draw_gain')]
     spurious = (0.0, 0.0)
+    clear = _clear(cycles, _CLEAR_NORMAL)
     if gains:
         of_gains = _superposed(orders, gains, trigger_cycles, cycle_moments(
-            orders, gains, nodes=_PAIR_NODES))
+            orders, gains, nodes=_PAIR_NODES), clear)
         spurious = (of_gains[0] * cycles.mean**3,
                     of_gains[1] * cycles.mean * np.abs(cycles.mean) ** 2)
     short = [process for process in near if process.correlation_length <= _REACH]
     if not short:
-        every = _superposed(orders, processes, trigger_cycles, cycles)
+        every = _superposed(orders, processes, trigger_cycles, cycles, clear)
         return every[0] - spurious[0], every[1] - spurious[1]
     alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
     unmixed, mixed = _integrated(orders, short, trigger_cycles, alone)
     gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
     if len(short) == len(near):
         return unmixed * gain**3, mixed * gain * np.abs(gain) ** 2
-    every = _superposed(orders, processes, trigger_cycles, cycles)
-    close = _superposed(orders, short, trigger_cycles, alone)
+    clear &= _clear(alone, _CLEAR)
+    every = _superposed(orders, processes, trigger_cycles, cycles, clear)
+    close = _superposed(orders, short, trigger_cycles, alone, clear)
     return (every[0] - spurious[0] + (unmixed - close[0]) * gain**3,
             every[1] - spurious[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
+
+
+def _clear(cycles: CycleMoments, most: float) -> BoolArray:
+    """Return where the variance of a cycle is so many times its squared mean at most (order,)."""
+    return np.asarray(np.real(cycles.variance[0]) < most * np.abs(cycles.mean) ** 2)
 
 
 def _integrated(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
