@@ -14,6 +14,7 @@ from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
+import resource
 import subprocess
 import sys
 
@@ -514,6 +515,20 @@ def test_file_that_cannot_be_written_is_a_warning(ros_graph, tmp_path):
     assert text.startswith('baseline file: ')
     assert 'the baseline cannot be written' in text
     assert b.change()['baseline'] == {'averages': 60, 'complete': True}
+
+
+def test_a_full_disk_is_a_warning_and_the_node_ends_well(tmp_path):
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limit[1]))  # no file can hold a byte
+    try:
+        with running(baseline_file=str(tmp_path / 'baseline.npz')) as b:
+            b.play(DrawnMachine(12), 5)
+            b.node.keep_state()
+            level, text, _ = b.diagnostics()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert level == WARN
+    assert 'the baseline cannot be written: File too large' in text
 
 
 def test_arrays_hold_nan_and_nothing_else_happens(ros_graph):

@@ -24,7 +24,7 @@ from itertools import count
 import json
 import os
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, IO
 import zipfile
 
 import numpy as np
@@ -42,7 +42,7 @@ _LARGEST_FILE = 1 << 28
 _LEARNING = ('group_averages', 'speed_bin', 'state_bin')
 
 
-def lock_baseline(path: Path) -> TextIO | None:
+def lock_baseline(path: Path) -> IO[bytes] | None:
     """
     Keep other processes from using a baseline until the result is closed, or this process ends.
 
@@ -50,24 +50,24 @@ def lock_baseline(path: Path) -> TextIO | None:
     None where there can be no such file, nor a baseline.
     Raises RecordingError, in one line, while another one has the lock.
     """
-    if path.exists() and not path.is_file():
-        return None
     try:
+        if path.exists() and not path.is_file():
+            return None
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = path.with_name(f'.{path.name}.lock').open('a+')
+        # What a full disk refuses may not wait in a buffer: `close` would fail, too.
+        lock = path.with_name(f'.{path.name}.lock').open('a+b', buffering=0)
     except OSError:
         return None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         lock.truncate(0)
-        lock.write(f'{os.getpid()}')
-        lock.flush()
+        lock.write(f'{os.getpid()}'.encode())
     except BlockingIOError:
         with lock:
             lock.seek(0)
             raise RecordingError(
-                f'{path}: process {lock.read(20)} keeps its baseline there: end that one, or give '
-                'another baseline_file') from None
+                f'{path}: process {lock.read(20).decode()} keeps its baseline there: end that '
+                'one, or give another baseline_file') from None
     except OSError:  # a full disk, or a file system without locks
         pass
     return lock
