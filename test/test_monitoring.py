@@ -16,6 +16,7 @@ import errno
 from functools import cache
 import math
 import os
+from pathlib import Path
 from types import SimpleNamespace
 import zipfile
 
@@ -26,7 +27,7 @@ import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
-from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
+from sa_jitter_ros.monitoring.baseline_file import lock_baseline, read_baseline, write_baseline
 from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
 from sa_jitter_ros.monitoring.evidence import ChangeEvidence, threshold
 from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor, Pairing
@@ -654,6 +655,15 @@ def test_file_that_unpacks_to_gigabytes_is_not_read(kept):
         read_baseline(path, 'pump 3', SETTINGS, 1.0)
 
 
+def test_baseline_of_many_channels_is_read_again(tmp_path):
+    path, monitor = tmp_path / 'baseline.npz', ShaftMonitor('input', Layout(2, (1.0,) * 300),
+                                                            SETTINGS)
+    monitor._products[:] = np.random.default_rng(1).random(monitor._products.shape)
+    write_baseline(path, '', {'input': monitor}, SETTINGS)
+    assert path.stat().st_size > 1 << 20
+    assert read_baseline(path, '', SETTINGS, 1.0).keys() == {'input'}
+
+
 def test_every_cut_and_flipped_byte_is_noticed(kept):
     path, rng = kept[2], np.random.default_rng(5)
     whole = path.read_bytes()
@@ -673,9 +683,9 @@ def test_every_cut_and_flipped_byte_is_noticed(kept):
 def test_file_that_is_no_file_or_another_archive_is_refused(tmp_path):
     path = tmp_path / 'fifo.npz'
     os.mkfifo(path)
-    for place in (path, tmp_path):
-        with pytest.raises(RecordingError):
-            read_baseline(place, '', SETTINGS, 1.0)
+    for place in (path, tmp_path, Path('/dev/full')):
+        with pytest.raises(RecordingError, match='is no regular file: give another baseline_file'):
+            lock_baseline(place)
     other = tmp_path / 'other.npz'
     np.savez(other, vibration=np.zeros(3))
     with pytest.raises(RecordingError, match='is no intact baseline'):

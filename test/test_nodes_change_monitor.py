@@ -506,15 +506,31 @@ def test_file_has_the_names_of_machine_and_node(monkeypatch, machine, node, name
     assert baseline_path('none', machine, node) is None
 
 
-def test_file_that_cannot_be_written_is_a_warning(ros_graph, tmp_path):
+@pytest.mark.parametrize('place', ['file', '/proc'])
+def test_file_that_cannot_be_written_is_a_warning_from_the_start(ros_graph, tmp_path, place):
     (tmp_path / 'file').write_text('in the way')
-    b = MonitorBench(ros_graph, baseline_file=str(tmp_path / 'file' / 'baseline.npz'))
-    b.play(DrawnMachine(11), 60)
-    level, text, _ = b.diagnostics()
-    assert level == WARN
-    assert text.startswith('baseline file: ')
-    assert 'the baseline cannot be written' in text
+    b = MonitorBench(ros_graph, baseline_file=str(tmp_path / place / 'baseline.npz'))
+    for count in (0, 60):
+        b.play(DrawnMachine(11), count)
+        level, text, _ = b.diagnostics()
+        assert level == WARN
+        assert text.startswith('baseline file: ')
+        assert 'the baseline cannot be written' in text
     assert b.change()['baseline'] == {'averages': 60, 'complete': True}
+
+
+@pytest.mark.parametrize(('given', 'reason'), [
+    ({'baseline_file': '/dev/full'}, '/dev/full: is no regular file: give another baseline_file'),
+    ({'baseline_file': '', 'hardware_id': 'a' * 300}, 'File name too long')])
+def test_what_can_be_no_file_is_an_error(ros_graph, tmp_path, monkeypatch, capfd, given, reason):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    b = MonitorBench(ros_graph, **given)
+    for _ in range(2):
+        level, text, _ = b.diagnostics()
+        assert (level, reason in text) == (ERROR, True)
+        assert b.set_parameter('relearn', True) == (True, '')
+    assert Path('/dev/full').exists()
+    assert 'a new baseline' not in capfd.readouterr().err
 
 
 def test_a_full_disk_is_a_warning_and_the_node_ends_well(tmp_path):

@@ -17,7 +17,8 @@ state of its monitor. A new file replaces the old one when it is complete; the z
 damage.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 import fcntl
 from itertools import count
@@ -33,7 +34,6 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.monitoring.evidence import below
 from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import Layout
-from sa_jitter_ros.parameter_file import require_regular_file
 from sa_jitter_ros.whole_files import finished_together
 
 FORMAT = 'sa_jitter_ros change baseline 1'
@@ -48,11 +48,11 @@ def lock_baseline(path: Path) -> IO[bytes] | None:
 
     The lock is that of a file beside it, whose text is the number of the process that holds it.
     None where there can be no such file, nor a baseline.
-    Raises RecordingError, in one line, while another one has the lock.
+    Raises RecordingError, in one line, while another one has the lock, or for what is no file.
     """
     try:
         if path.exists() and not path.is_file():
-            return None
+            raise RecordingError(f'{path}: is no regular file: give another baseline_file')
         path.parent.mkdir(parents=True, exist_ok=True)
         # What a full disk refuses may not wait in a buffer: `close` would fail, too.
         lock = path.with_name(f'.{path.name}.lock').open('a+b', buffering=0)
@@ -79,13 +79,13 @@ def set_aside(path: Path) -> None:
 
     Raises RecordingError, in one line, where that is not possible.
     """
-    other = next(name for number in count(1) if not (
-        name := path.with_name(f'{path.stem}.{number}{path.suffix}')).exists())
     try:
+        other = next(name for number in count(1) if not (
+            name := path.with_name(f'{path.stem}.{number}{path.suffix}')).exists())
         if path.exists():
             path.rename(other)
     except OSError as error:
-        raise RecordingError(f'{path}: the old baseline cannot be kept as {other.name}: '
+        raise RecordingError(f'{path}: the old baseline cannot be kept under another name: '
                              f'{error.strerror or error}') from error
 
 
@@ -104,11 +104,18 @@ def write_baseline(path: Path, machine: str, monitors: Mapping[str, ShaftMonitor
         f'{shaft}/{name}': array for shaft, item in monitors.items()
         for name, array in item.state().items()}
     arrays['machine'] = np.array(json.dumps(about))
+    with new_files(path) as folder, (folder / path.name).open('wb') as file:
+        np.savez_compressed(file, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def new_files(path: Path) -> Iterator[Path]:
+    """Yield a folder for the file of a baseline; raises RecordingError as `write_baseline`."""
     try:
-        with finished_together(path.parent) as folder, (folder / path.name).open('wb') as file:
-            np.savez_compressed(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
+        with finished_together(path.parent) as folder:
+            yield folder
     except OSError as error:
         raise RecordingError(f'{path}: the baseline cannot be written: '
                              f'{error.strerror or error}') from error
@@ -140,7 +147,8 @@ def read_baseline(path: Path, machine: str, settings: Settings, share: float
     except RecordingError:
         raise
     except OSError as error:
-        raise RecordingError(f'{path}: {error.strerror or error}') from error
+        raise RecordingError(f'{path}: {error.strerror or error}: give another '
+                             'baseline_file') from error
     except Exception as error:  # damaged zip files raise exceptions of many types
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RecordingError(f'{path}: is no intact baseline ({reason}): restore it from a '
@@ -149,7 +157,6 @@ def read_baseline(path: Path, machine: str, settings: Settings, share: float
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return description and arrays of a file."""
-    require_regular_file(path)
     with zipfile.ZipFile(path) as archive:
         size = sum(item.file_size for item in archive.infolist())
     if size > _LARGEST_FILE:

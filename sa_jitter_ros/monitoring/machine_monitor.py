@@ -24,7 +24,7 @@ from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.baseline_file import (
-    lock_baseline, read_baseline, set_aside, write_baseline)
+    lock_baseline, new_files, read_baseline, set_aside, write_baseline)
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.operating import OperatingState
@@ -218,6 +218,12 @@ class MachineMonitor:
             'changes': [*(item.content() for item in self.limits.passed()),
                         *(item.content() for item in self.changes())]})
         return found
+
+    def try_to_save(self) -> None:
+        """Raise RecordingError where `save` could write no file."""
+        if self.path is not None:
+            with new_files(self.path):
+                pass
 
     def save(self) -> None:
         """Write the file; raises RecordingError where it cannot be written."""

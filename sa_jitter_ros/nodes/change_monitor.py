@@ -101,7 +101,6 @@ class ChangeMonitor(MonitoringNode):
         """Begin to monitor with the baseline of the file, or with none."""
         values = self._values
         self._monitor: MachineMonitor | None = None
-        self._saved, self._was_complete = time.monotonic(), False
         reason = ''
         given = self.parameters.given_values
         parts, channels = Machine.among(given), channels_of(given)
@@ -112,7 +111,7 @@ class ChangeMonitor(MonitoringNode):
                 values[HARDWARE_ID.name], values['shafts'], Settings.of(values), self._path,
                 parts=parts, limits=limits, anew=anew,
                 state=self._state)
-            self._was_complete = self._monitor.is_complete
+            self._save(self._monitor, trial=True)
         except RecordingError as error:
             reason = str(error)
         self._fail('baseline', reason)
@@ -146,7 +145,8 @@ class ChangeMonitor(MonitoringNode):
             for shaft in values['shafts']:
                 self._fail(f'baseline of {shaft}', '')
             self._begin(anew=True)
-            self.get_logger().info('a new baseline is learnt')
+            if self._monitor is not None:
+                self.get_logger().info('a new baseline is learnt')
             self._publish()
             self.set_parameters([RosParameter('relearn', value=False)])
         elif self._monitor is not None:
@@ -191,11 +191,11 @@ class ChangeMonitor(MonitoringNode):
             if lines or due or self._monitor.is_complete != self._was_complete:
                 self._save(self._monitor)
 
-    def _save(self, monitor: MachineMonitor) -> None:
-        """Write the baseline to its file, and say if that is not possible."""
+    def _save(self, monitor: MachineMonitor, *, trial: bool = False) -> None:
+        """Write the baseline to its file, or try to, and say if that is not possible."""
         self._saved, self._was_complete = time.monotonic(), monitor.is_complete
         try:
-            monitor.save()
+            (monitor.try_to_save if trial else monitor.save)()
         except RecordingError as error:
             self.set_missing('baseline file', f'{error}; it is tried again every '
                              f'{_SAVE_PERIOD:.0f} s')
