@@ -355,9 +355,11 @@ def test_one_keyphasor_is_used_and_the_others_counted(bench, named):
     b.play(MACHINE, 1.0, change=and_another)
     assert len(b.amplitudes()) == 3
     assert_true(b.amplitudes(), MACHINE, ORDERS)
-    status = b.status()
-    assert status['pulses_dropped'] == 40 + named
-    assert status['keyphasor'] == 'kp'
+    level, text, status = b.diagnostics()
+    assert (level == DiagnosticStatus.OK, 'restart with keyphasor: other' in text) == (
+        named, not named)
+    assert status['pulses_dropped'] == ('0' if named else '40')
+    assert (status['pulses_of_others'], status['keyphasor']) == (str(40 + named), 'kp')
 
 
 @pytest.mark.parametrize(('end', 'says'), [

@@ -174,7 +174,7 @@ def test_input_that_is_refused_is_not_called_silent(averager, clock, monkeypatch
     text = play(wrong, 'other')
     assert '/vibration since the start 6 s ago: what comes is refused: data_offset 2 ' in text
     assert ("no /tach_pulse for 6 s: what comes is refused: pulses of keyphasor 'other' are "
-            "ignored, those of 'kp' are used: set the parameter keyphasor" in text)
+            "ignored, those of 'kp' are used: restart with keyphasor: other to use them" in text)
     assert 'publishes nothing' not in text
     monkeypatch.setattr(b.node._averager, 'add_samples', lambda block: 1 / 0)
     good = messages.encode_samples(MACHINE.block(0, 64))
@@ -185,6 +185,16 @@ def test_input_that_is_refused_is_not_called_silent(averager, clock, monkeypatch
     b.settle()
     clock.now += 6.0
     assert '/vibration for 6 s: /test publishes nothing' in b.diagnostics()[1]
+
+
+def test_a_misspelt_keyphasor_is_named_with_the_one_that_comes(ros_graph, clock):
+    b = AveragerBench(ros_graph, keyphasor='pk', stale_after=5.0)
+    for _ in range(6):
+        clock.now += 1.0
+        b.send_pulses([0.0])
+    level, text, _ = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert "what comes is refused: pulses of keyphasor 'kp' are ignored, those of 'pk'" in text
 
 
 @pytest.mark.parametrize(('kind', 'message', 'says'), [
@@ -267,7 +277,7 @@ def test_each_keyphasor_may_have_its_publisher(ros_graph):
     assert 'single source of /tach_pulse' in b.diagnostics()[1]
     second.publish(messages.encode_pulse_reference(0.0, 'other'))
     b.settle()
-    assert b.spin(lambda: b.status()['pulses_dropped'])
+    assert b.spin(lambda: b.status()['pulses_of_others'])
     assert 'single source' not in b.diagnostics()[1]
 
 

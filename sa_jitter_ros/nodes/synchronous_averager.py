@@ -134,9 +134,12 @@ class SynchronousAverager(MonitoringNode):
             self._sources.add(source)
         if source != self._keyphasor:
             self._other_keyphasors += 1
-            raise SignalError(f'pulses of keyphasor {source!r} are ignored, those of '
-                              f'{self._keyphasor!r} are used: set the parameter keyphasor to '
-                              'choose')
+            reason = (f'pulses of keyphasor {source!r} are ignored, those of {self._keyphasor!r} '
+                      f'are used: restart with keyphasor: {source} to use them')
+            if not self._values['keyphasor']:
+                raise SignalError(reason)
+            self.refused[self._tach.topic_name] = reason
+            return
         self._add_pulses(times)
 
     def _add_pulses(self, times: FloatArray) -> None:
@@ -180,7 +183,8 @@ class SynchronousAverager(MonitoringNode):
         averager = self._averager
         self._samples.show_warning()
         self.counts.update(averager.totals)
-        self.counts['pulses_dropped'] += self._other_keyphasors
+        if not self._values['keyphasor']:  # which makes others expected
+            self.counts['pulses_dropped'] += self._other_keyphasors
         if self._cycles_per_second:
             self._average_flow.allowance = (
                 self._values['trigger_cycles'] / self._cycles_per_second)
@@ -194,6 +198,7 @@ class SynchronousAverager(MonitoringNode):
         published = sum(shaft.published for shaft in self._shafts.values())
         values = {'trigger_cycles': str(averager.counts.cycles), 'averages': str(published),
                   'keyphasor': self._keyphasor or '',
+                  'pulses_of_others': str(self._other_keyphasors),
                   **{f'pulses_{key}': str(count)
                      for key, count in asdict(averager.pulse_counts).items()}}
         if averager.geometry is not None:
