@@ -10,6 +10,7 @@
 
 """The machine file and the transport profile of the package start its nodes."""
 
+from importlib import import_module
 import os
 from pathlib import Path
 import signal
@@ -248,6 +249,24 @@ def test_chain_names_the_nodes_that_it_can_add(capsys):
     assert left.value.code == 2
     line, = capsys.readouterr().err.splitlines()
     assert 'live_view' in line
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_a_node_says_what_its_arguments_are(name, capfd, monkeypatch):
+    main = import_module(f'sa_jitter_ros.nodes.{name}').main
+    monkeypatch.setattr('sys.argv', [name, '--help'])
+    assert main() == 0
+    assert capfd.readouterr().out.startswith(f'usage: {name} --ros-args [-p NAME:=VALUE]')
+    for given, says in {
+            ('--params', 'rig.yaml'): 'did you mean --ros-args --params-file rig.yaml?',
+            ('-p', 'rate:=12'): 'did you mean --ros-args -p rate:=12?',
+            ('--frobnicate',): 'see --help'}.items():
+        monkeypatch.setattr('sys.argv', [name, *given])
+        assert main() == 2
+        assert capfd.readouterr().err == f'error: {" ".join(given)}: is not for a node: {says}\n'
+    assert main(['--ros-args', '-q', 'x:=3']) == 2
+    assert ("error: ['-q', 'x:=3'] are no arguments of ROS: give -p NAME:=VALUE, --params-file "
+            'FILE or -r OLD:=NEW\n') in capfd.readouterr().err
 
 
 @pytest.mark.parametrize('command', [['--params'], ['--ros-args', '--params-file']])

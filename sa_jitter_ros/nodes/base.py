@@ -12,6 +12,7 @@
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from inspect import getdoc
 import re
 import socket
 import sys
@@ -34,6 +35,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.utilities import remove_ros_args
 from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import first_of, Flow, Health, Level
 from sa_jitter_ros.nodes.lifetime import end_within, InterruptOnce, SECONDS
@@ -46,6 +48,9 @@ DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps'
                    'clock_deviation', 'messages_rejected')
 WARNING_PERIOD = 5.0  # s between log lines of the same kind
 WARNING_KINDS = 10
+_USAGE = ('usage: {} --ros-args [-p NAME:=VALUE] [--params-file FILE] [-r OLD:=NEW]\n\n{}\n\n'
+          'Parameters: docs/parameters.md, or ros2 param describe while it runs')
+_UNKNOWN = ' are no arguments of ROS: give -p NAME:=VALUE, --params-file FILE or -r OLD:=NEW'
 
 
 def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
@@ -335,19 +340,24 @@ def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
     use_one_thread()
     interrupt = InterruptOnce()
     nodes: list[MonitoringNode] = []
-    given = sys.argv if args is None else args
+    given = sys.argv[1:] if args is None else args
     try:
         _check_parameter_files(given)
-        rclpy.init(args=args)
+        others = remove_ros_args(given)
+        if {'-h', '--help'} & {*others}:
+            print(_USAGE.format(_name_of(node_classes[0]), getdoc(node_classes[0])))
+            return 0
+        if others:
+            raise ParameterError(_no_arguments(others))
+        rclpy.init(args=given)
     except (ParameterError, RuntimeError) as error:  # rcl cannot read the command line or a file
-        print(f'error: {error}', file=sys.stderr)
+        print(f'error: {error}' + _UNKNOWN * str(error).startswith('['), file=sys.stderr)
         return 2
     try:
         try:
             for node_class in node_classes:
-                name = re.sub('(?<=.)(?=[A-Z])', '_', node_class.__name__).lower()
-                nodes.append(node_class(
-                    parameter_overrides=given_parameters(name, given, process)))
+                nodes.append(node_class(parameter_overrides=given_parameters(
+                    _name_of(node_class), given, process)))
         except (InvalidParameterTypeException, RuntimeError) as error:  # of rclpy's own parameters
             if rclpy.ok():
                 print(f'error: {error}', file=sys.stderr)
@@ -369,6 +379,27 @@ def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
         interrupt.ending = True
         _end(nodes)
     return 0
+
+
+def _name_of(node_class: Callable[..., MonitoringNode]) -> str:
+    """Return the name of a node, which is that of its executable."""
+    return re.sub('(?<=.)(?=[A-Z])', '_', node_class.__name__).lower()
+
+
+def _no_arguments(others: Sequence[str]) -> str:
+    """
+    Return what is wrong with arguments that are not for ROS, and what may be meant.
+
+    >>> _no_arguments(['--params', 'rig.yaml'])
+    '--params rig.yaml: is not for a node: did you mean --ros-args --params-file rig.yaml?'
+    >>> _no_arguments(['trigger_cycles:=12'])
+    'trigger_cycles:=12: is not for a node: did you mean --ros-args -p trigger_cycles:=12?'
+    """
+    last = others[-1]
+    meant = f'-p {last}' if ':=' in last else (
+        f'--params-file {last}' if last.endswith(('.yaml', '.yml')) else '')
+    return f'{" ".join(others)}: is not for a node: ' + (
+        f'did you mean --ros-args {meant}?' if meant else 'see --help')
 
 
 def _end(nodes: Sequence[MonitoringNode]) -> None:

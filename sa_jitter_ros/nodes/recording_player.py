@@ -49,7 +49,11 @@ PARAMETERS = (
 
 
 class RecordingPlayer(PlaybackNode):
-    """Publishes the vibration and the keyphasor of a recording."""
+    """
+    Publishes the vibration and the keyphasor of a recording.
+
+    The option `--field NAME=VALUE` sets its parameter `fields`; it may be repeated.
+    """
 
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('recording_player', PARAMETERS, **node_kwargs)
@@ -201,7 +205,7 @@ def with_fields(args: Sequence[str]) -> list[str]:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node; `--field NAME=VALUE` sets its parameter `fields`."""
-    return run_node(RecordingPlayer, with_fields(sys.argv if args is None else args))
+    return run_node(RecordingPlayer, with_fields(sys.argv[1:] if args is None else args))
 
 
 if __name__ == '__main__':
