@@ -762,13 +762,14 @@ def run(environment, *arguments, before=''):
 
 
 @pytest.mark.processes
-def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
+def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, tmp_path, number):
     file = tmp_path / 'averager.yaml'
     file.write_text('/**:\n  ros__parameters:\n    trigger_cycles: 12\n    shaft:\n'
                     '      ratio: 2\n      orders: [1, 38]\n')
     process = run(process_environment, '--params-file', str(file))
     assert process.stdout.readline() == 'spinning\n'
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     assert re.fullmatch(r'.*started: averages 12 trigger cycles of shaft\n', errors)

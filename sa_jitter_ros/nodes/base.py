@@ -325,14 +325,14 @@ def _type_name(kind: type) -> str:
 
 
 def run_node(node_class: Callable[..., MonitoringNode], args: Sequence[str] | None = None) -> int:
-    """Run one node until SIGINT or SIGTERM; return 0, or 2 after one line on a bad argument."""
+    """Run one node until a signal ends it; return 0, or 2 after one line on a bad argument."""
     return run_nodes([node_class], args)
 
 
 def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
               args: Sequence[str] | None = None, process: Sequence[str] = ()) -> int:
     """
-    Run nodes in one executor until SIGINT or SIGTERM; return the status of `run_node`.
+    Run nodes in one executor until SIGINT, SIGTERM or SIGHUP; return the status of `run_node`.
 
     The process is that of the nodes: it ends if the middleware hangs after such a signal.
     `process` are names under which a file may have parameters of all these nodes.

@@ -9,7 +9,7 @@
 # the License.
 
 """
-How a process of nodes ends: at the first SIGINT, and soon, whatever the middleware does.
+How a process of nodes ends: at the first SIGINT or SIGHUP, and soon, whatever the middleware does.
 
 A hanging call of the middleware holds the lock of the Python interpreter: no Python thread can end
 the process then. A timer of the C library does, whose threads call functions of C.
@@ -50,14 +50,20 @@ class _Times(ctypes.Structure):
 
 
 class InterruptOnce:
-    """A handler of SIGINT that interrupts Python once; later ones find it ending already."""
+    """
+    A handler that interrupts Python once; later signals find it ending already.
+
+    It takes SIGINT, and SIGHUP of a terminal that is closed unless `nohup` has it ignored.
+    """
 
     def __init__(self) -> None:
         self.ending = False
         if in_main_thread():
-            signal.signal(signal.SIGINT, self)
-            # Python takes its handlers away when it ends.
-            atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+            ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            for number in (signal.SIGINT,) if ignored else (signal.SIGINT, signal.SIGHUP):
+                signal.signal(number, self)
+                # Python takes its handlers away when it ends.
+                atexit.register(signal.signal, number, signal.SIG_IGN)
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Interrupt what runs, the first time."""
