@@ -263,6 +263,40 @@ def test_averager_without_indicators_is_monitored(ros_graph):
     assert [item['name'] for item in b.change()['changes']] == ['19']
 
 
+class DeafMachine(DrawnMachine):
+    """A machine whose channel 1 has no data while `deaf`."""
+
+    deaf = True
+
+    def messages(self):
+        """Return the arrays of an average."""
+        arrays = super().messages()
+        for array in arrays if self.deaf else ():
+            array.values[1, ..., 1 if array is arrays[0] else 0:] = np.nan
+        return arrays
+
+
+def test_a_channel_without_data_is_named_and_never_complete(ros_graph):
+    b, machine = MonitorBench(ros_graph), DeafMachine(7)
+    b.play(machine, 60)
+    assert b.change()['baseline'] == {'averages': 60, 'complete': False}
+    level, text, _ = b.diagnostics()
+    assert level == WARN
+    assert text.startswith('channels of input: 1 not judged, the latest averages have no values ')
+    machine.deaf = False
+    b.play(machine, 20)
+    level, text, _ = b.diagnostics()
+    assert (level, text.partition(' at ')[0]) == (OK, 'learning: 20 of 40 averages of input')
+    b.play(machine, 20)
+    assert b.change()['baseline'] == {'averages': 100, 'complete': True}
+    machine.deaf = True
+    b.play(machine, 4)
+    level, text, _ = b.diagnostics()
+    assert (level, text.partition(',')[0]) == (WARN, 'channels of input: 1 not judged')
+    assert b.set_parameter('relearn', True) == (True, '')
+    assert b.diagnostics()[0] == OK
+
+
 def test_wrong_messages_cost_themselves(ros_graph):
     b, machine = MonitorBench(ros_graph), DrawnMachine(8)
     orders, indicators, errors, envelope = machine.messages()
@@ -554,3 +588,6 @@ def test_arrays_hold_nan_and_nothing_else_happens(ros_graph):
             array.values[0] = array.values[0] if kind == 'order_amplitude' else np.nan
             b.send(f'input/{kind}', messages.encode_average(kind, array))
     assert b.change() == {'baseline': {'averages': 60, 'complete': True}, 'changes': []}
+    assert b.diagnostics()[1] == (
+        'no change in 60 averages; without values: rms of input, channel 0; kurtosis of input, '
+        'channel 0; m8a of input, channel 0; bearing order 4.9 of input, channel 0')

@@ -110,9 +110,8 @@ class MachineMonitor:
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
         self._others: dict[str, ShaftMonitor] = {}
-        self._lock = None
+        self._lock = None if path is None else lock_baseline(path)
         if path is not None:
-            self._lock = lock_baseline(path)
             try:
                 if anew:
                     set_aside(path)
@@ -187,8 +186,8 @@ class MachineMonitor:
         if not average.layout.channels:
             raise MessageError('average of no channel: publish at least one')
         self._without[shaft] += 1
-        known = bool(np.isfinite(average.values).any())
-        if not (known and (average.layout.indicators or self._without[shaft] >= _WITHOUT)):
+        if not (np.isfinite(average.values).any() and (
+                average.layout.indicators or self._without[shaft] >= _WITHOUT)):
             return None
         self.monitors[shaft] = ShaftMonitor(
             shaft, average.layout, self._settings, share=1.0 / len(self.shafts),

@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.arrays import Array, FloatArray
+from sa_jitter_ros.arrays import Array, BoolArray, FloatArray
 from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine, UNKNOWN
@@ -240,6 +240,7 @@ class ShaftMonitor:
         self._intervals: list[float] = []
         self._end = math.nan
         self._last: AverageHeader | None = None
+        self._lacking: BoolArray = np.zeros(layout.shape, np.bool_)  # in the latest group
         #: Averages taken, at all speeds, and those left out.
         self.averages = self.overlapping = self.uncorrected = self.beyond = 0
 
@@ -258,8 +259,7 @@ class ShaftMonitor:
                 last is None or _slides(last, header)):
             self.overlapping += 1
             return []
-        if not average.is_corrected:
-            self.uncorrected += 1
+        self.uncorrected += not average.is_corrected
         if not np.isfinite(average.values).any():
             return []
         key = self._bin_of(header.mean_trigger_speed, average.state)
@@ -291,6 +291,7 @@ class ShaftMonitor:
 
     def _test_group(self, key: int, group: _Group) -> list[str]:
         means = group.means()
+        self._lacking = np.isnan(means[0])
         values = means[0].reshape(1, -1)
         place, level = self._test.bins.get(key), values
         if place is not None:
@@ -303,11 +304,8 @@ class ShaftMonitor:
         mark = (float(group.first.sequence), group.first.start_time)
         changed, ended = self._test.update(key, values, noise, doubt, mark,
                                            self.scores_per_alarm())
-        lines = []
-        if changed.any():
-            lines = [str(item) for item in self.changes()
-                     if changed.reshape(self.layout.shape)[
-                         item.channel, self.layout.quantities.index((item.kind, item.name))]]
+        lines = [str(item) for item in self.changes() if changed.reshape(self.layout.shape)[
+            item.channel, self.layout.quantities.index((item.kind, item.name))]]
         return lines + [f'{self._words(place)} is back at its baseline'
                         for place in np.flatnonzero(ended[0]).tolist()]
 
@@ -341,18 +339,28 @@ class ShaftMonitor:
         """
         Return the number of averages in the baseline at the present speed.
 
-        Those with more noise than the others count less.
+        It is that of the channel with the fewest. Those with more noise than others count less.
         """
-        place, group = self._test.bins.get(self._bin), self._groups.get(self._bin)
-        count = 0.0 if place is None else float(place.count.max())
-        return round(count * self.settings.group_averages) + (group.count if group else 0)
+        group = self._groups.get(self._bin)
+        return round(float(self._learnt().min()) * self.settings.group_averages) + (
+            group.count if group else 0)
 
     @property
     def is_complete(self) -> bool:
-        """Return whether the baseline at the present speed is learnt: averages are tested."""
+        """Return whether the baseline of all channels at the present speed is learnt."""
+        return bool(self._learnt().min() > self.settings.learning_groups - 0.5)
+
+    def _learnt(self) -> FloatArray:
+        """Return the number of groups that each channel has learnt at the present speed."""
         place = self._test.bins.get(self._bin)
-        return place is not None and bool(
-            place.count.max() > self.settings.learning_groups - 0.5)
+        return np.zeros(self.layout.channels) if place is None else np.asarray(
+            place.count.reshape(self.layout.shape).max(axis=1))
+
+    def not_judged(self) -> tuple[list[int], list[str]]:
+        """Return the channels, and the quantities of others, that the latest averages lack."""
+        channels = np.asarray(self._lacking.all(axis=1))
+        others = np.flatnonzero(self._lacking & ~channels[:, None]).tolist()
+        return np.flatnonzero(channels).tolist(), [self._words(place) for place in others]
 
     @property
     def place(self) -> str:
@@ -397,15 +405,17 @@ class ShaftMonitor:
 
         Of orders it is the root mean square of the amplitudes with their noise.
         """
-        if not self.is_complete:
+        if (place := self._test.bins.get(self._bin)) is None:
             return np.full(self.layout.shape, np.nan)
-        known = self._test.bins[self._bin].baseline()
+        known = place.baseline()
         count = len(self.layout.orders)
         mean, noise = (item.reshape(self.layout.shape) for item in (known.mean, known.noise))
         noise = noise * self.settings.group_averages
-        return np.concatenate([
+        usual = np.concatenate([
             (np.maximum(mean[:, :count], 0.0)**2 + noise[:, :count])**0.25,
             np.exp(mean[:, count:])], axis=1)
+        return np.where(
+            self._learnt()[:, None] > self.settings.learning_groups - 0.5, usual, np.nan)
 
     # --- changes ---
 

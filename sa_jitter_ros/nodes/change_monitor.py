@@ -109,8 +109,7 @@ class ChangeMonitor(MonitoringNode):
         try:
             self._monitor = MachineMonitor(
                 values[HARDWARE_ID.name], values['shafts'], Settings.of(values), self._path,
-                parts=parts, limits=limits, anew=anew,
-                state=self._state)
+                parts=parts, limits=limits, anew=anew, state=self._state)
             self._save(self._monitor, trial=True)
         except RecordingError as error:
             reason = str(error)
@@ -233,6 +232,11 @@ class ChangeMonitor(MonitoringNode):
         for name in self._monitor.limits.names:
             self.set_missing(f'limit {name}', self._monitor.limits.missing.get(name, ''))
         self.counts.update(averages_overlapping=sum(item.overlapping for item in found.values()))
+        for shaft in self._monitor.shafts:
+            silent = ', '.join(map(str, found[shaft].not_judged()[0] if shaft in found else ()))
+            self.set_missing(f'channels of {shaft}', (
+                f'{silent} not judged, the latest averages have no values of them: look at '
+                'sensor and cable') if silent else '')
         for shaft, lack in self._monitor.uncorrected.items():
             self.set_missing(f'comparison of {shaft}', (
                 f'without {lack}, order_amplitude has no corrected amplitudes: set '
@@ -267,8 +271,9 @@ class ChangeMonitor(MonitoringNode):
                     f'{item.place}' + (
                         f', of {item.averages} in all bins: larger ones learn sooner'
                         if item.averages > enough else ''), values)
-        return (f'{changes} changes' if changes else
-                f'no change in {monitor.averages} averages'), values
+        others = [name for item in found.values() for name in item.not_judged()[1]]
+        return (f'{changes} changes' if changes else f'no change in {monitor.averages} averages'
+                ) + (f'; without values: {first_of(others)}' if others else ''), values
 
 
 def baseline_path(file: str, machine: str, node: str) -> Path | None:
