@@ -385,6 +385,9 @@ def test_long_averages_with_known_errors_are_predicted_or_refused(name, cycles):
     if cycles > 20_000 and name in ('missing_pulses', 'keyphasor_quantisation'):
         with pytest.raises(ModelError, match=r'is 100000 with 2 orders.* at most 20000 cycles'):
             predict(model, effects)
+        many = replace(model, trigger_cycles=1000, orders=tuple(range(1, 101)))
+        with pytest.raises(ModelError, match=r'is 1000 with 100 orders.* at most 500 cycles; '):
+            predict(many, effects)
         return
     prediction = predict(model, effects)
     assert np.all((prediction.mean_attenuation > 0.0) & (prediction.mean_attenuation < 1.0))

@@ -40,8 +40,8 @@ from sa_jitter_ros.prediction.moments import (
     AverageMoments, correlation_length, cycle_moments, CycleMoments, noise_line_variance)
 from sa_jitter_ros.prediction.parts import Parts
 from sa_jitter_ros.prediction.sampled_distribution import (
-    affordable_draws, can_be_sampled, distribution_of, drawn_averages, LONGEST, moments_of,
-    MOST_PHASORS, number_of_places, SampledDistribution)
+    affordable_draws, distribution_of, drawn_averages, moments_of, most_cycles, number_of_places,
+    SampledDistribution)
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
 from sa_jitter_ros.pulses.angle_law import LINEAR_LAW
 
@@ -210,7 +210,7 @@ def _of_random(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gai
             getattr(parts, name)[plain] = getattr(own, name)
     found = _of_parts(parts.of(np.newaxis), gain)
     few = _few_independent(model, jitters, cycles, spread) if alike else None
-    if few_cycles(cycles, count, few) and can_be_sampled(processes, count, orders.size):
+    if few_cycles(cycles, count, few) and count <= most_cycles(processes, orders.size):
         return _with_draws(found, model, processes, gain)
     return found
 
@@ -227,8 +227,8 @@ def known_amplitudes(model: DeclaredModel, processes: Sequence[AngleErrorProcess
     found, cycles = _with_errors(model, processes, errors, gain)
     count = model.trigger_cycles
     independent = all(isinstance(process, IndependentPulseJitter) for process in processes)
-    if not independent and few_cycles(cycles, count, None) and can_be_sampled(
-            processes, count, len(model.orders)):
+    if not independent and few_cycles(cycles, count, None) and count <= most_cycles(
+            processes, len(model.orders)):
         return _with_draws(found, model, processes, gain, errors, apart=True)
     return found
 
@@ -331,7 +331,7 @@ def _pooled(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors
     independent = all(isinstance(process, IndependentPulseJitter) for process in processes)
     few = count <= _FEW_CYCLES_OF_SCENARIOS or few_cycles(
         cycles, count, _FEW_CYCLES_OF_SCENARIOS if independent else None)
-    if few and can_be_sampled(processes, count, len(model.orders)):
+    if few and count <= most_cycles(processes, len(model.orders)):
         return _with_draws(found, model, processes, gain, errors)
     return found
 
@@ -351,12 +351,13 @@ def _with_draws(found: Amplitudes, model: DeclaredModel, processes: Sequence[Ang
 def _drawn(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: Array,
            influences: Sequence[tuple[Influence, Array]]) -> Amplitudes:
     """Return amplitudes of averages that are drawn, each with its scenario."""
-    if not can_be_sampled(processes, model.trigger_cycles, len(model.orders)):
+    most = most_cycles(processes, len(model.orders))
+    if model.trigger_cycles > most:
         names = ', '.join(item.name for item, _ in influences)
         raise ModelError(
             f'trigger_cycles is {model.trigger_cycles} with {len(model.orders)} orders: averages '
-            f'under {names} are drawn one by one, of at most {LONGEST} cycles and {MOST_PHASORS} '
-            'cycles times orders, less where slow motions come on top; predict fewer')
+            f'under {names} are drawn one by one, of so many orders with at most {most} cycles; '
+            'predict fewer cycles or fewer orders')
 
     def known(count: int) -> Array:
         total: Array = np.zeros(())

@@ -148,16 +148,15 @@ class SampledDistribution:
             values, np.clip(index, 0, count - 1), axis=1))
 
 
-def can_be_sampled(processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int
-                   ) -> bool:
-    """Return whether averages of all processes can be drawn, and in about a second."""
+def most_cycles(processes: Sequence[AngleErrorProcess], orders: int) -> int:
+    """Return how many cycles averages have at most that can be drawn in about a second."""
     pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
-    points = trigger_cycles * (1 if pulsed else _PLACES)
     drawn = _MOST_POINTS if any(hasattr(item, 'draw_angle') or hasattr(item, 'draw_gain')
-                                for item in processes) else math.inf
-    return points <= min(drawn, LONGEST) and points * orders <= MOST_PHASORS and all(
-        any(hasattr(process, f'draw_{what}') for what in ('pulses', 'angle', 'gain'))
-        for process in processes)
+                                for item in processes) else LONGEST
+    possible = all(any(hasattr(process, f'draw_{what}') for what in ('pulses', 'angle', 'gain'))
+                   for process in processes)
+    most = min(drawn, LONGEST, MOST_PHASORS // max(orders, 1)) * possible
+    return most // (1 if pulsed else _PLACES)
 
 
 def drawn_averages(orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
@@ -166,11 +165,12 @@ def drawn_averages(orders: ArrayLike, processes: Sequence[Any], trigger_cycles: 
     """
     Return X - 1 (order, draw) of averages of `trigger_cycles` cycles, and noise, E|n|^2 1.
 
-    `processes` `can_be_sampled`; `weights` are those of the angle law. ``known(count)`` returns
-    pulse errors (count, n) in fundamental cycles that come on top of the random ones, of all N_t -
-    1 + weights.pulses pulses or of the average's own N_t + 1. The errors `each` (scenario, n) come
-    on top of the same random ones each, so that draws are (order, scenario, draw). `spread` is the
-    standard deviation of the random errors in cycles of the highest order.
+    `processes` can be drawn (`most_cycles`); `weights` are those of the angle law.
+    ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come on top of the
+    random ones, of all N_t - 1 + weights.pulses pulses or of the average's own N_t + 1. The errors
+    `each` (scenario, n) come on top of the same random ones each, so that draws are (order,
+    scenario, draw). `spread` is the standard deviation of the random errors in cycles of the
+    highest order.
 
     Both parts of X - 1 are right to some digits of single precision, relative to themselves. They
     have double precision of tables of few values, where averages have few, too, and of errors too
