@@ -61,7 +61,7 @@ def test_summary_says_amplitudes_with_intervals_and_units(ros_graph, bench):
     average = b.amplitudes()[-1]
     status, motor = summaries[-1].status
     assert motor.name == 'shaft: motor'
-    assert motor.values[2].value.endswith(' m/s^2, attenuation nan')
+    assert motor.values[2].value.endswith(' m/s^2')
     assert (status.name, status.hardware_id, status.level) == (
         'shaft: gear_box', 'rig', DiagnosticStatus.OK)
     stamp = summaries[-1].header.stamp
@@ -72,12 +72,31 @@ def test_summary_says_amplitudes_with_intervals_and_units(ros_graph, bench):
     names = ['assembly phase shaft-out', 'mesh shaft-out 1x', '23']
     assert [*values][:3] == names
     for row, order, name in zip(average.values[0], ORDERS, names):
-        found = re.fullmatch(r'(\S+) \+- (\S+) g, attenuation nan', values[name])
+        found = re.fullmatch(r'(\S+) \+- (\S+) g', values[name])
         assert float(found[1]) == pytest.approx(
             2.0 * abs(MACHINE.components[order][0]), rel=1e-3)  # volts over 0.5 V per g
         assert float(found[2]) == pytest.approx(1.96 * row[8], rel=0.06)
     assert values['rms'].endswith(' g')
     assert 'kurtosis' in values
+
+
+def test_a_summary_says_what_lines_and_channels_are_not_there(ros_graph, bench):
+    summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
+    b = bench(shaft__orders=[7.0, 11.0], correct_jitter=True, keyphasor_rate=1e4)
+    rng = np.random.default_rng(1)
+
+    def one_without(number, block):
+        samples = block.samples + 0.1 * rng.standard_normal(block.samples.shape)
+        samples[1] = np.nan
+        return [replace(block, samples=samples)]
+
+    b.play(MACHINE, 3.0, change=one_without)
+    status, deaf = summaries[-1].status
+    values = {item.key: item.value for item in status.values}
+    assert ' +- ' in values['7']
+    assert re.fullmatch(r'below 0\.0\d+', values['11'])
+    assert (deaf.level, deaf.message) == (
+        DiagnosticStatus.WARN, 'no data: look at sensor and cable')
 
 
 def test_the_level_of_a_summary_is_that_of_the_worst_limit(ros_graph, bench):
@@ -134,7 +153,7 @@ def test_averages_of_before_have_their_own_channels(ros_graph, bench, blocks):
         assert len(summaries[name]) == len(b.amplitudes(name)) == 1
         assert [item.name for item in summaries[name][0].status] == [
             f'{name}: channel 0', f'{name}: channel 1']
-        assert ' g, ' in summaries[name][0].status[0].values[2].value
+        assert summaries[name][0].status[0].values[2].value.endswith(' g')
     assert 'Error' not in b.diagnostics()[1]
 
 

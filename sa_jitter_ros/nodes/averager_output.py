@@ -35,6 +35,7 @@ from std_msgs.msg import Float64MultiArray
 
 ROUNDING = 1e-9  # relative scatter of a constant that was resampled
 _ORDERS = 10  # of a summary, the strongest ones
+_THERE = 2.45  # standard errors of an amplitude that noise alone passes in 5 %
 _STATUS = dict(zip(('', *LEVELS), (
     DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)))
 
@@ -83,14 +84,12 @@ class ShaftOutput:
                 'NaN or infinite' if is_lacking and average.fundamental_cycles else '')
             self._node.set_missing(f'channel {channel} of vibration', (
                 f'{what}, look at its sensor and cable' if what else ''))
-        correction = average.correction
-        if correction is None:  # not asked for
+        if (correction := average.correction) is None:  # not asked for
             self._refusals = Shortfall()
         else:
             self._refusals.add(not correction.accepted)
-            if not correction.accepted:
-                self.refused += 1
-                self.refusal = correction.reason
+            self.refused += not correction.accepted
+            self.refusal = correction.reason or self.refusal
         self._node.set_missing(f'correction of {self._name}',
                                f'refused for {self._refusals}: {self.refusal}'
                                if self._refusals else '')
@@ -102,7 +101,8 @@ def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: Chan
     """
     Return one status for each channel; `results` are those of `ShaftResults`.
 
-    Its level is that of the worst of the limits that are `passed`, the worst first.
+    Its level is that of the worst of the limits that are `passed`, the worst first; a channel
+    without data is a warning.
     """
     table = results['order_amplitude']
     message = DiagnosticArray()
@@ -117,11 +117,13 @@ def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: Chan
                   'trigger_speed_hz': f'{table.header.mean_trigger_speed:.6g}',
                   **orders, **_indicators(results, channel, unit)}
         worst = next((item for item in passed if item.channel == channel), None)
+        deaf = bool(np.isnan(results['synchronous_average'].values[channel]).all())
         message.status.append(DiagnosticStatus(
-            level=_STATUS[worst.level if worst else ''], name=f'{shaft}: {name}',
-            hardware_id=hardware_id, message=str(
-                worst or f'average {table.header.sequence} of {table.header.trigger_cycles} '
-                f'trigger cycles at {table.header.mean_trigger_speed:.4g} Hz'),
+            level=_STATUS[worst.level if worst else LEVELS[0] if deaf else ''],
+            name=f'{shaft}: {name}', hardware_id=hardware_id, message=str(
+                worst or 'no data: look at sensor and cable' * deaf or (
+                    f'average {table.header.sequence} of {table.header.trigger_cycles} '
+                    f'trigger cycles at {table.header.mean_trigger_speed:.4g} Hz')),
             values=[KeyValue(key=key, value=value) for key, value in values.items()]))
     return message
 
@@ -133,10 +135,13 @@ def _orders(table: FloatArray, unit: str, name_of: Callable[[float], str]
     amplitude, error, _ = best_amplitudes(table)
     known = np.flatnonzero(np.isfinite(amplitude))
     for place in sorted(known[np.argsort(-amplitude[known])][:_ORDERS]):
-        order = field['order'][place]
-        yield name_of(order) or order_text(order), (
-            f'{_interval(amplitude[place], error[place], unit)}, '
-            f'attenuation {field["attenuation"][place]:.3g}')
+        order, share = field['order'][place], field['attenuation'][place]
+        text = _interval(amplitude[place], error[place], unit)
+        if amplitude[place] <= _THERE * error[place]:
+            text = f'below {field["upper_95"][place]:.2g} {unit}'.rstrip()
+        elif math.isfinite(share):
+            text += f', attenuation {share:.3g}'
+        yield name_of(order) or order_text(order), text
 
 
 def _indicators(results: Mapping[str, AverageMessage], channel: int, unit: str) -> dict[str, str]:

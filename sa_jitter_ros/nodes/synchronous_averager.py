@@ -64,7 +64,8 @@ class SynchronousAverager(MonitoringNode):
         self._latest = {name: deque[Average](maxlen=_LATEST) for name in names}
         self._averager = streaming_averager(values, buffer_seconds=values['buffer_seconds'])
         self._check(values)
-        self._apply_indicators(values)
+        for name, shaft in self._shafts.items():
+            shaft.use(gear_settings(values, name))
         self._values = values
         self._revolutions = keyphasor_parameters(values).revolutions_per_trigger
         self._keyphasor: str | None = values['keyphasor'] or None
@@ -108,9 +109,6 @@ class SynchronousAverager(MonitoringNode):
         changed = {name: shaft_settings(values, name) for name in self._shafts}
         if changed != {name: shaft_settings(before, name) for name in self._shafts}:
             self._averager.change(changed)
-        self._apply_indicators(values)
-
-    def _apply_indicators(self, values: Values) -> None:
         for name, shaft in self._shafts.items():
             shaft.use(gear_settings(values, name))
 
