@@ -416,7 +416,7 @@ def test_corrupt_file_is_refused_and_kept(learned, capfd):
 
 
 @pytest.mark.machines
-def test_relearn_begins_a_baseline_and_keeps_the_file_of_the_old_one(learned):
+def test_relearn_begins_a_baseline_and_keeps_the_file_of_the_old_one(learned, capfd):
     machine, path, content = learned
     before = path.read_bytes()
     with running(baseline_file=str(path)) as b:
@@ -429,6 +429,7 @@ def test_relearn_begins_a_baseline_and_keeps_the_file_of_the_old_one(learned):
             assert path.with_name('baseline.1.npz').read_bytes() == before
             b.play(machine, 50)
             assert b.change() == {'baseline': {'averages': 50, 'complete': True}, 'changes': []}
+    assert 'well again' not in capfd.readouterr().err
     with running(baseline_file=str(path.with_name('baseline.1.npz'))) as b:
         assert b.change() == content
     with pytest.raises(ParameterError, match='relearn is true: set it while the node runs'):

@@ -101,7 +101,7 @@ class ChangeMonitor(MonitoringNode):
         """Begin to monitor with the baseline of the file, or with none."""
         values = self._values
         self._monitor: MachineMonitor | None = None
-        reason = ''
+        self._fail('baseline', '')
         given = self.parameters.given_values
         parts, channels = Machine.among(given), channels_of(given)
         limits = LimitWatch(parts, values['shafts'], list(channels),
@@ -112,8 +112,7 @@ class ChangeMonitor(MonitoringNode):
                 parts=parts, limits=limits, anew=anew, state=self._state)
             self._save(self._monitor, trial=True)
         except RecordingError as error:
-            reason = str(error)
-        self._fail('baseline', reason)
+            self._fail('baseline', str(error))
 
     def _hold(self) -> None:
         """Let a value of the operating state count until it is stale."""
@@ -141,6 +140,7 @@ class ChangeMonitor(MonitoringNode):
         self._hold()
         if values['relearn']:
             self._close()
+            self._missing.pop('the machine has changed', None)
             for shaft in values['shafts']:
                 self._fail(f'baseline of {shaft}', '')
             self._begin(anew=True)
