@@ -17,6 +17,7 @@ All ends when the process of averager, predictor and analyser does.
 """
 
 import json
+import os
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
@@ -40,13 +41,15 @@ def generate_launch_description() -> LaunchDescription:
             f'{", ".join((*IN_CHAIN, SIMULATOR))}')),
         DeclareLaunchArgument('recording', default_value='', description=(
             'file that is played as the source; empty: your sensors, or the simulator')),
+        DeclareLaunchArgument('use_sim_time', default_value='false', description=(
+            'true: stamps of the nodes are those of /clock')),
         OpaqueFunction(function=processes)])
 
 
 def processes(context: LaunchContext) -> list[Node]:
     """Return the processes for the arguments; raises RuntimeError for wrong ones."""
     given = context.launch_configurations
-    recording, params = given['recording'], given['params']
+    recording, params = (os.path.expanduser(given[name]) for name in ('recording', 'params'))
     chosen = list(filter(None, map(str.strip, given['with'].split(','))))
     unknown = [name for name in chosen if name not in (*IN_CHAIN, SIMULATOR)]
     if unknown:
@@ -56,10 +59,13 @@ def processes(context: LaunchContext) -> list[Node]:
         raise RuntimeError('both a recording and the simulator would publish: leave out one')
     if not params and SIMULATOR in chosen:
         params = str(SHIPPED)
-    for name, path in (('params', params), ('recording', recording)):
-        if path and not Path(path).exists():
-            raise RuntimeError(f'{name}:={path}: no such file')
+    if params and not Path(params).is_file():
+        raise RuntimeError(f'params:={params}: no such file')
+    if recording and not Path(recording).exists():  # a bag is a folder
+        raise RuntimeError(f'recording:={recording}: no such file or folder')
     file = ['--params-file', params] if params else []
+    if given['use_sim_time'] != 'false':
+        file += ['-p', f'use_sim_time:={given["use_sim_time"]}']
     tach = ['-p', 'tach:=waveform'] if 'detector' in chosen else []
     added = [IN_CHAIN[name] for name in chosen if name in IN_CHAIN]
 

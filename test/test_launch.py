@@ -24,7 +24,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / 'launch' / 'monitor.launch.py'
 MACHINE = str(ROOT / 'config' / 'machine.yaml')
-ARGUMENTS = {'params': '', 'namespace': '', 'with': 'monitor', 'recording': ''}
+ARGUMENTS = {'params': '', 'namespace': '', 'with': 'monitor', 'recording': '',
+             'use_sim_time': 'false'}
 
 
 def load():
@@ -77,9 +78,19 @@ def test_recording_is_the_source(processes, tmp_path):
     assert (alone.arguments, alone.ros_arguments) == ([], [])
 
 
+def test_a_home_is_found_and_a_simulated_clock_is_for_all(processes, monkeypatch, tmp_path):
+    (tmp_path / 'rig.yaml').touch()
+    monkeypatch.setenv('HOME', str(tmp_path))
+    for process in processes(params='~/rig.yaml', recording='~/', use_sim_time='true'):
+        assert process.ros_arguments[:4] == [
+            '--params-file', str(tmp_path / 'rig.yaml'), '-p', 'use_sim_time:=true']
+    assert process.ros_arguments[-1] == f'recording:="{tmp_path}/"'
+
+
 @pytest.mark.parametrize(('given', 'line'), [
     ({'with': 'monitr'}, 'with:=monitr: monitr is none of monitor, live_view, detector'),
     ({'params': '/none.yaml'}, 'params:=/none.yaml: no such file'),
+    ({'params': '/tmp'}, 'params:=/tmp: no such file'),
     ({'recording': '/none.npz'}, 'recording:=/none.npz: no such file'),
     ({'recording': MACHINE, 'with': 'simulator'}, 'leave out one')])
 def test_wrong_arguments_are_refused(processes, given, line):
