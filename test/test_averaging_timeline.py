@@ -101,6 +101,13 @@ def test_wrong_time_is_counted_from_half_a_sample_on_and_a_new_run_from_the_tole
     assert 'sample 400 differs by +0.011 s' in timeline.messages[-1]
 
 
+def test_stamps_that_stand_still_are_named():
+    timeline = timeline_of(block(0, 100, time=0.0), block(100, 100, time=0.0),
+                           block(200, 100, time=0.0), block(300, 100, time=0.3))
+    assert sum('stamps stand still, send the time of each block' in line
+               for line in timeline.messages) == 2
+
+
 def test_time_that_jumps_back_over_consecutive_indices_is_another_epoch():
     timeline = timeline_of(block(0, 1000), block(1000, 100, time=0.9), block(1100, 100, time=1.0))
     assert [item[0] for item in held(timeline)] == [0, 1]

@@ -368,9 +368,8 @@ class VibrationTimeline:
             f'{self.layout[0]} at {self.layout[1]:.10g} Hz: send one layout or restart the source')
 
     def _follows(self, block: SampleBlock, following: SampleBlock) -> bool:
-        expected = block.start_time + block.samples.shape[1] / block.sample_rate
-        return (following.index == block.end_index
-                and abs(following.start_time - expected) <= self.time_tolerance)
+        late = following.start_time - block.start_time - block.samples.shape[1] / block.sample_rate
+        return following.index == block.end_index and abs(late) <= self.time_tolerance
 
     def _doubtful(self, block: SampleBlock) -> bool:
         """Whether only the next block can show if this one belongs to the run."""
@@ -384,8 +383,9 @@ class VibrationTimeline:
             self.counts.clock_deviation += 1
             self.messages.append(
                 f'time of sample {block.index} differs by {deviation:+.6g} s from the clock of '
-                f'the run (limit {self.time_tolerance:g} s): a new run begins if the next block '
-                'continues it')
+                f'the run (limit {self.time_tolerance:g} s): ' + (
+                    'a new run begins if the next block continues it' if block.start_time !=
+                    last.start_time else 'stamps stand still, send the time of each block'))
             return True
         # Other samples with the same indices are those of a source that restarted.
         start, end = max(block.index, last.index), min(block.end_index, last.end_index)
