@@ -31,7 +31,7 @@ from sa_jitter_ros.monitoring.quantities import KINDS
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import first_of, Flow
 from sa_jitter_ros.nodes.messages import decode_average, known_type
-from sa_jitter_ros.nodes.result_flows import ResultFlows
+from sa_jitter_ros.nodes.result_flows import ResultFlows, UNCORRECTED
 from sa_jitter_ros.parameters import (
     fixed, HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
 from sa_jitter_ros.recordings.channel_units import channels_of, scale_of
@@ -239,10 +239,8 @@ class ChangeMonitor(MonitoringNode):
                 'sensor and cable') if silent else '')
         for shaft, lack in self._monitor.uncorrected.items():
             self.set_missing(f'comparison of {shaft}', (
-                f'without {lack}, order_amplitude has no corrected amplitudes: set '
-                'correct_jitter: true in the averager; if the averager refuses the correction '
-                '(see its diagnostics), use a better keyphasor, or allow_uncorrected: true if it '
-                'will never be exchanged') if lack else '')
+                f'without {lack}, {UNCORRECTED}, or allow_uncorrected: true if it will never be '
+                'exchanged') if lack else '')
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return what is learnt and how many quantities have changed."""

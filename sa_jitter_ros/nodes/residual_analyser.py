@@ -37,7 +37,7 @@ from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
                                           encode_residual, ResidualMessage)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name
-from sa_jitter_ros.nodes.result_flows import ResultFlows
+from sa_jitter_ros.nodes.result_flows import ResultFlows, UNCORRECTED
 from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
@@ -125,10 +125,7 @@ class ResidualAnalyser(MonitoringNode):
             self._batch.add(average)
         else:
             self._uncorrected += 1
-            self._skipped_because = (
-                'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
-                'averager; if the averager refuses the correction (see its diagnostics), use a '
-                'better keyphasor')
+            self._skipped_because = UNCORRECTED
         self._skipped.add(interrupted or not corrected)
         self.set_missing('comparison', f'without {self._skipped}, {self._skipped_because}'
                          if self._skipped else '')
@@ -283,12 +280,10 @@ class ResidualAnalyser(MonitoringNode):
         response = yield from self._answer(partial(
             self._predictor.set_parameters_atomically,
             [as_ros_parameter(name, value) for name, value in wanted.items()]))
-        refused = ''
-        if response is None:
-            refused = ('does not answer: its effects cannot be set; start the node, or set the '
-                       'parameter predictor to its name')
-        elif not response.result.successful:
-            refused = f'refuses the effects: {response.result.reason}'
+        refused = (
+            'does not answer: its effects cannot be set; start the node, or set the parameter '
+            'predictor to its name' if response is None else '' if response.result.successful else
+            f'refuses the effects: {response.result.reason}')
         self.set_missing('closed loop', refused and f'{self._predictor_name} {refused}')
         if not refused:
             self._added = set(found)

@@ -18,6 +18,9 @@ from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.health import Flow
 
 AVERAGE = 'order_amplitude'
+UNCORRECTED = (f'{AVERAGE} has no corrected amplitudes: set correct_jitter: true in the averager; '
+               'if the averager refuses the correction (see its diagnostics), use a better '
+               'keyphasor')
 _OPTIONAL = ('envelope_amplitude',)  # of shafts with bearing orders
 _ATTENUATION = AMPLITUDE_FIELDS.index('attenuation')
 
