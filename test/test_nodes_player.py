@@ -234,6 +234,24 @@ def test_loop_goes_on_in_time_and_index(bench, recording):
     assert len(player.samples()[0]) % 4000 == 0
 
 
+def test_a_loop_that_begins_after_the_end_is_refused(bench):
+    player = bench()
+    player.play()
+    assert player.set_parameter('loop', True) == (
+        False, 'loop is true after the end: set playing: true with it')
+    player.node.set_parameters_atomically([Parameter(name, value=True)
+                                           for name in ('loop', 'playing')])
+    assert player.spin(lambda: len(player.received['vibration']) > 120)
+
+
+def test_a_recording_that_nobody_takes_is_a_warning(ros_graph, tmp_path, recording, capfd):
+    write_npz(tmp_path / 'rig.npz', recording)
+    node = ros_graph.add(RecordingPlayer, {
+        'recording': str(tmp_path / 'rig.npz'), 'rate': 50.0, 'wait_seconds': 0.0})
+    assert ros_graph.spin(lambda: not node.get_parameter('playing').value)
+    assert capfd.readouterr().err.count('nobody took the vibration') == 1
+
+
 def test_nan_is_a_gap(bench, recording):
     vibration = recording.read()
     vibration[:, 950:1730] = np.nan

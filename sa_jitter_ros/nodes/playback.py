@@ -98,10 +98,9 @@ class PlaybackNode(MonitoringNode):
         self._tach_pulse: PulseOutput | None = None  # where there is something to publish
         self._waveform: Any = None
         self._pacer = Pacer(values['rate'])
-        self._playing, self._started = values['playing'], False
-        self._asked, self._idle_until = time.monotonic(), 0.0
-        self._wait = values['wait_seconds']
-        self._sent = 0.0
+        self._playing, self._started, self._heard = values['playing'], False, False
+        self._asked, self._wait = time.monotonic(), values['wait_seconds']
+        self._idle_until = self._sent = 0.0
         self._progress_time = -math.inf
         self._stream: Iterator[Portion] | None = None
 
@@ -160,8 +159,7 @@ class PlaybackNode(MonitoringNode):
         now = time.monotonic()
         if not self._playing or now < self._idle_until or not (self._started or self._may_start()):
             return
-        due = self._pacer.due(now)
-        period = self._period(self._pacer.rate)
+        due, period = self._pacer.due(now), self._period(self._pacer.rate)
         most = math.ceil(period * self._pacer.rate / self._portion_seconds) + 1
         most = min(most, max(1, int(period * TRANSPORT_BYTES_PER_SECOND / self._portion_bytes)))
         try:
@@ -204,8 +202,12 @@ class PlaybackNode(MonitoringNode):
         if portion is None:
             self.get_logger().info(
                 f'end: {self.progress(self._sent)}, {self._pulses_sent()} pulses')
+            if not self._heard:
+                self.warn('nobody took the vibration: start its subscribers first, and compare '
+                          'topics and namespaces (ros2 topic list)')
             self._end()
             return False
+        self._heard = self._heard or self._vibration.get_subscription_count() > 0
         for block in portion.vibration:
             self._vibration.publish(self._encode(block))
         for block in portion.waveform:
@@ -224,9 +226,8 @@ class PlaybackNode(MonitoringNode):
         self.set_parameters([as_ros_parameter('playing', False)])
 
     def _log_progress(self) -> None:
-        now = time.monotonic()
-        if now - self._progress_time >= PROGRESS_PERIOD:
-            self._progress_time = now
+        if time.monotonic() - self._progress_time >= PROGRESS_PERIOD:
+            self._progress_time = time.monotonic()
             self.get_logger().info(self.progress(self._sent))
 
     def summary(self) -> tuple[str, dict[str, str]]:

@@ -24,7 +24,7 @@ from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.parameters import parameter_files
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
-from sa_jitter_ros.parameters import fixed, Parameter
+from sa_jitter_ros.parameters import fixed, Parameter, Values
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import usable_channels
@@ -98,6 +98,11 @@ class RecordingPlayer(PlaybackNode):
         self.get_logger().info(
             f'started: {values["recording"]}, {recording.channels} channels at '
             f'{recording.sample_rate:g} Hz, {recording.duration:.3f} s')
+
+    def check(self, values: Values) -> None:
+        """Raise ParameterError for a loop that begins after the end."""
+        if self._stream is None and values['loop'] > self.again() and not values['playing']:
+            raise ParameterError('loop is true after the end: set playing: true with it')
 
     def portions(self) -> Iterator[Portion]:
         """Return one pass through the recording; times and indices continue those of the last."""
