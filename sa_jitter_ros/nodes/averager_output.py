@@ -52,8 +52,7 @@ class ShaftOutput:
                          'pulse_error', 'envelope_amplitude', 'envelope_spectrum')}
         self._summary = node.create_output(DiagnosticArray, f'{name}/summary')
         self._summarised = -math.inf  # s, end of the latest average in a summary
-        self._results = ShaftResults()
-        self._refusals = Shortfall()
+        self._results, self._refusals = ShaftResults(), Shortfall()
         self.published = self.refused = 0
         self.refusal = ''
 

@@ -81,10 +81,9 @@ class ResidualAnalyser(MonitoringNode):
         self._significant = self._waited = False
         self._added: set[str] = set()  # names of the effects that were set in the predictor
         self._verdict = self._activity = ''
-        self._batches = self._uncorrected = self._interrupted = 0
+        self._batches = self._uncorrected = self._interrupted = self._unresolved = 0
         self._skipped, self._skipped_because = Shortfall(), ''
-        self._unresolved = self._untraced = 0
-        self._predictor_name = self._values['predictor']
+        self._untraced, self._predictor_name = 0, self._values['predictor']
         self._predictor = AsyncParameterClient(self, self._predictor_name)
         shaft = self._values['shaft']
         self._residual = self.create_output(Float64MultiArray, 'residual')

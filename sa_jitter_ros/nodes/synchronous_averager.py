@@ -70,8 +70,7 @@ class SynchronousAverager(MonitoringNode):
         self._revolutions = keyphasor_parameters(values).revolutions_per_trigger
         self._keyphasor: str | None = values['keyphasor'] or None
         self._sources: set[str] = set()  # of tach pulses
-        self._other_keyphasors = 0
-        self._cycles_per_second = 0.0
+        self._other_keyphasors, self._cycles_per_second = 0, 0.0
         self._samples = SampleInput(self, values, self.parameters.declare_channels())
         pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')

@@ -69,8 +69,8 @@ class TachDetector(MonitoringNode):
         self._timeline = VibrationTimeline(time_tolerance=values['time_tolerance'])
         self._detector = detector_of(values)
         self._run = 0, 0.0  # epoch and sampling rate of what the detector follows
-        self._pulses = self._unsendable = 0
-        self._too_close = self._unused = self._spikes = 0  # of earlier detectors
+        # The last three are of earlier detectors.
+        self._pulses = self._unsendable = self._too_close = self._unused = self._spikes = 0
         self._waiting: deque[float] = deque()
         self._output = PulseOutput(self, values['tach_type'])
         if self._joint:  # several publishers may send the joints of a robot
