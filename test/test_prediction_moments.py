@@ -14,7 +14,9 @@ import numpy as np
 from processes import gaussian_pulse_jitter
 import pytest
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.prediction.angle_error import GaussianAngleError, IndependentPulseJitter
+from sa_jitter_ros.prediction import moments
+from sa_jitter_ros.prediction.angle_error import (
+    GaussianAngleError, IndependentPulseJitter, joint_characteristic)
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -100,6 +102,23 @@ def test_moments_and_third_cumulants_agree_with_monte_carlo(distribution, cycles
         for part in (np.real, np.imag):
             tolerance = 4.5 * part(sample).std() / np.sqrt(off.size) + 1e-12
             assert part(sample).mean() == pytest.approx(part(expected[0]), abs=tolerance)
+
+
+def test_many_orders_are_taken_in_parts(monkeypatch):
+    orders, sizes, process = np.arange(1.0, 41.0), [], IndependentPulseJitter(Uniform(0.03))
+
+    def noted(processes, coefficients, *places):
+        sizes.append(len(coefficients[0]))
+        return joint_characteristic(processes, coefficients, *places)
+
+    monkeypatch.setattr(moments, 'joint_characteristic', noted)
+    found = cycle_moments(orders, [process])
+    assert max(sizes) <= 16
+    for place in (0, 20, 39):
+        one = cycle_moments(orders[place:place + 1], [process])
+        for name in ('mean', 'variance', 'pseudo_variance'):
+            np.testing.assert_allclose(getattr(found, name)[..., place],
+                                       getattr(one, name)[..., 0], rtol=1e-9, atol=1e-14)
 
 
 def test_seconds_become_cycles_by_the_fundamental_frequency():

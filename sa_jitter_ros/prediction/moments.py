@@ -34,6 +34,7 @@ from sa_jitter_ros.prediction.angle_error import (
 from sa_jitter_ros.prediction.distributions import is_number
 
 NODES = 64
+_TOGETHER = 16  # orders whose arrays a processor keeps near
 _NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly
 # Cycles of the order from which on a rule over the square is too coarse; panels of the distance.
 _WIDE, _PANEL, _PANELS, _INSIDE = 8.0, 0.15, 1000, 12
@@ -121,10 +122,13 @@ def cycle_moments(orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, 
     Section 2 of the theory; Eqs. 30-37 of Camerini et al. 2019 as special cases.
     """
     g = require_orders(orders)
+    if g.size > _TOGETHER:
+        found = [vars(cycle_moments(some, processes, nodes=nodes, lags=lags)).values()
+                 for some in np.array_split(g, range(_TOGETHER, g.size, _TOGETHER))]
+        return CycleMoments(*(np.concatenate(item, axis=-1) for item in zip(*found)))
     u, w = unit_nodes(nodes)
     plane, signs = g[:, None, None], np.array([-1.0, 1.0])[:, None, None, None]
-    first = joint_characteristic(processes, [g[:, None]], [u], [0])
-    mean = first @ w
+    mean = joint_characteristic(processes, [g[:, None]], [u], [0]) @ w
     pairs = []
     fine = (u, w, mean)
     rule = unit_nodes(min(nodes, max(_FAR_NODES, nodes // 4)))
