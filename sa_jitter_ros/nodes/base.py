@@ -340,10 +340,10 @@ def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
     use_one_thread()
     interrupt = InterruptOnce()
     nodes: list[MonitoringNode] = []
-    given = sys.argv[1:] if args is None else args
+    given = sys.argv if args is None else args
     try:
         _check_parameter_files(given)
-        others = remove_ros_args(given)
+        others = [item for item in remove_ros_args(given) if item != sys.argv[0]]
         if {'-h', '--help'} & {*others}:
             print(_USAGE.format(_name_of(node_classes[0]), getdoc(node_classes[0])))
             return 0

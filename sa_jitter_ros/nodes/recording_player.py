@@ -210,7 +210,7 @@ def with_fields(args: Sequence[str]) -> list[str]:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node; `--field NAME=VALUE` sets its parameter `fields`."""
-    return run_node(RecordingPlayer, with_fields(sys.argv[1:] if args is None else args))
+    return run_node(RecordingPlayer, with_fields(sys.argv if args is None else args))
 
 
 if __name__ == '__main__':
