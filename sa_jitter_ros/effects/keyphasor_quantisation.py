@@ -12,10 +12,10 @@
 Keyphasor quantisation: pulse times on the grid of a clock, to which their errors are locked.
 
 A clock of the declared keyphasor rate is the cause of the declared jitter: its errors replace the
-independent ones. So do those of a slower clock, if the declared jitter is that of the rate. The
-errors of another clock are added. Errors of a steady machine
-repeat, p_{k+1} = p_k - T f mod 1, so that the mean over all starting phases need not be what one
-average shows: where pulses were measured, the prediction is made for their own phases.
+independent ones. So do those of any clock, if the declared jitter is that of the rate; jitter that
+is declared as such comes on top. Errors of a steady machine repeat, p_{k+1} = p_k - T f mod 1, so
+that the mean over all starting phases need not be what one average shows: where pulses were
+measured, the prediction is made for their own phases.
 """
 
 from collections.abc import Mapping
