@@ -28,7 +28,8 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import DataWarning, SignalError
 from sa_jitter_ros.parameters import number, Values
 from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS, OPTIONS
-from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
+from sa_jitter_ros.pulses.threshold import (
+    SchmittTrigger, state_levels, StateLevels, whole_pulses)
 from sa_jitter_ros.samples import SampleBlock
 
 __all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'detector_of',
@@ -47,6 +48,8 @@ _DRIFTED = 0.5
 # crosses the threshold several times, but at most this fraction of the level difference.
 _BEYOND_NOISE, _WIDEST = 4.0, 0.2
 _FEWEST = 40  # samples from which levels are learnt: ten intervals of four
+# The longest window, s and samples: two pulses of a shaft at 0.05 Hz, or 32 MB.
+_LONGEST, _MOST = 64.0, 1 << 22
 _LOUDER = 1.5  # change of the noise that is another one
 # Part of a lobe that a signal must pass on either side of the resting level.
 _PASSED = 0.4
@@ -83,8 +86,9 @@ class KeyphasorDetector:
     """
     Find the pulses of one keyphasor in a stream of blocks of samples of any size.
 
-    The detector learns the two state levels from the first `learning_time` seconds that show them,
-    and updates them once per window of that length. Samples wait until then, so that no pulse is
+    The detector learns the two state levels from the first window that holds whole pulses, and
+    updates them from each later one. Windows have `learning_time` seconds or, for slow shafts,
+    twice as many, and twice again, up to a minute. Samples wait until then, so that no pulse is
     lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels that two windows have
     agreed on change only where the next two agree on others, so that no single event, whatever its
     size, moves them for longer. Up to three samples that are farther from all others than these
@@ -102,7 +106,7 @@ class KeyphasorDetector:
     :param edge: the pulse's 'rising' (first) edge, its 'falling' edge or the 'centre' of the two.
     :param interpolate: False gives the time of the first sample past the threshold.
     :param minimum_interval: pulses that follow sooner (s) are dropped and counted.
-    :param learning_time: seconds, two revolutions or more.
+    :param learning_time: seconds of the shortest window.
     :param minimum_difference: state levels closer than this (waveform's unit) are noise.
     :raises ParameterError: an option is out of range.
 
@@ -138,6 +142,7 @@ class KeyphasorDetector:
         self._decided = self._polarity != 'auto'
         self._rate, self._origin, self._index = 0.0, np.nan, 0
         self._window: list[Piece] = []
+        self._held = 0  # samples in the window
         self._levels: StateLevels | None = None
         self._confirmed = False
         self._pending: StateLevels | None = None
@@ -178,23 +183,31 @@ class KeyphasorDetector:
             self._origin, self._index = start_time, 0
         self._samples += block.size
         found = []
-        window = block.size if not self._learns else max(
-            round(self._learning_time * sample_rate), _FEWEST)
+        window = self._least() if self._learns else max(block.size, 1)
         while block.size:
-            piece, block = np.split(block, [window - sum(part.size for *_, part in self._window)])
+            piece, block = np.split(block, [window - self._held % window])
             part = self._origin, self._index, self._sign * piece
-            if self._learns:
-                self._window.append(part)
             if self._levels or not self._learns:
                 found.append(self._detect(part))
             self._index += piece.size
-            if sum(part.size for *_, part in self._window) == window:
-                found.append(self._learn())
+            if self._learns:
+                self._window.append(part)
+                self._held += piece.size
+                if self._held % window == 0:
+                    found.append(self._review(window))
         return np.concatenate(found) if found else _NONE
 
     def flush(self) -> FloatArray:
         """Return the pulse times (s) in samples that wait for levels, at a recording's end."""
-        return self._learn() if self._levels is None and self._window else _NONE
+        size, found = self._held, _NONE
+        while size and self._levels is None:
+            found = self._learn(size, whole=size < self._held)
+            size = size // 2 if size > self._least() else 0
+        return found
+
+    def _least(self) -> int:
+        """Return the number of samples of the shortest window."""
+        return max(round(self._learning_time * self._rate), _FEWEST)
 
     def _checked(self, samples: npt.ArrayLike, start_time: float, sample_rate: float
                  ) -> FloatArray:
@@ -217,9 +230,22 @@ class KeyphasorDetector:
                               'finite; leave the block out, which makes a gap')
         return block
 
-    def _learn(self) -> FloatArray:
-        """Learn the levels from a full window; return its pulses if they waited for the levels."""
-        window = np.concatenate([part for *_, part in self._window])
+    def _review(self, window: int) -> FloatArray:
+        """Learn from the shortest window that holds whole pulses; each is twice as long."""
+        most = max(min(_LONGEST * self._rate, _MOST), window)
+        size, found = window, _NONE
+        while self._held and not self._held % size and size <= most:
+            size *= 2
+            found = self._learn(size // 2, whole=bool(self._levels) or size <= most)
+        self._levelless += bool(self._held)
+        if size > most:
+            self._held //= 2
+            self._window = _last(self._window, self._held)
+        return found
+
+    def _learn(self, size: int, *, whole: bool) -> FloatArray:
+        """Learn the levels from the last samples; return the pulses that waited for them."""
+        window = np.concatenate([part for *_, part in _last(self._window, size)])
         known = self._levels
         levels = state_levels(window[~known.spikes(window)] if known else window, known)
         if known and not levels.significant:  # larger pulses, perhaps
@@ -227,11 +253,9 @@ class KeyphasorDetector:
         useful = levels.significant and levels.difference > self._minimum_difference
         stopped = known and self._confirmed and not levels.pulsed and (
             levels.difference < _STOPPED * known.difference)
-        if stopped or not useful:
-            self._levelless += 1
-            self._window = [] if known else _last(self._window, window.size // 2)
+        if stopped or not useful or (whole and not whole_pulses(window, levels)):
             return _NONE
-        waiting, self._window = self._window, []
+        waiting, self._window, self._held = self._window, [], 0
         if known is None:
             if not self._decided:
                 waiting, levels = self._decide(waiting, levels)

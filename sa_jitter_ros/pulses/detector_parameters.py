@@ -27,7 +27,7 @@ DETECTOR_PARAMETERS = (
               'past the threshold'),
     Parameter('minimum_interval', 0.0, 'a pulse this soon after another is dropped',
               unit='s', minimum=0.0),
-    Parameter('learning_time', 0.5, 'length of the windows from which the levels are learnt',
+    Parameter('learning_time', 0.5, 'shortest window from which the levels are learnt',
               unit='s', above=0.0, maximum=60.0),
     Parameter('minimum_difference', 0.0, 'levels closer than this are noise [unit of the '
               'waveform]', minimum=0.0),

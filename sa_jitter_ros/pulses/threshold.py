@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ['SchmittTrigger', 'StateLevels', 'state_levels']
+__all__ = ['SchmittTrigger', 'StateLevels', 'state_levels', 'whole_pulses']
 
 
 _BINS = 100
@@ -58,6 +58,9 @@ _AT_LEVELS, _CLOSE = 0.6, 0.1
 # Mean length of the runs of samples in the rarer state that noise may have; and levels that are so
 # few steps of the samples apart may be a converter's last bit.
 _LONG, _STEPS = 2.5, 2.5
+# Pulses that a window must hold to show the levels; the noise over the level difference from which
+# on it is averaged away, and how many of its standard deviations are beyond it.
+_WHOLE, _QUIET, _BEYOND = 2, 0.1, 4.0
 # Samples of an edge that are kept at most, and how often a line is fitted to those in the band.
 _LONGEST, _ROUNDS = 1 << 16, 3
 _SECOND = 0.6745 * math.sqrt(6.0)  # median of second differences of white noise of size 1
@@ -172,6 +175,28 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
                    lowest=float(kept.min()), highest=float(kept.max()))
 
 
+def whole_pulses(samples: FloatArray, levels: StateLevels) -> bool:
+    """
+    Return whether samples (n,) rise and fall between their levels as often as two pulses do.
+
+    They do so beyond their noise, unless they do it at even intervals: samples of a part of a slow
+    pulse have levels, too, but others than the pulse.
+    """
+    sound = samples[~levels.spikes(samples)] - levels.middle
+    if _regular(_runs(sound > 0.0)[0]):
+        return True
+    reach = 2.0 * levels.lobe if levels.steep else levels.difference
+    # Second differences take edges for noise where pulses have few samples.
+    beside = np.abs(np.abs(sound) - 0.5 * levels.difference)
+    held = levels.steep or float(np.median(beside)) < _CLOSE * reach
+    noise = min(levels.noise, _QUIET * reach) if held else levels.noise
+    count = min(math.ceil(max(noise / (_QUIET * reach), 1.0)**2), sound.size)
+    mean = np.diff(np.cumsum(sound)[::count]) / count if count > 1 else sound
+    band = max(_BEYOND * noise / math.sqrt(count), _QUIET * reach)
+    outside = mean[np.abs(mean) > band] > 0.0
+    return int(np.count_nonzero(outside[1:] != outside[:-1])) >= 2 * _WHOLE
+
+
 def _in_last_bits(levels: StateLevels, samples: FloatArray) -> bool:
     """Return whether levels are as near as those between which the last bit of samples changes."""
     if (levels.low, levels.high) == (0.0, 1.0):  # of a digital input
@@ -266,6 +291,8 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
         begin, end = _runs(outside)
         spikes, longest = spikes + begin.size, max(longest, int(np.max(end - begin)))
         kept = kept[~outside]
+        if spikes > max(_FEW_SPIKES, kept.size // (2 * _PULSES_EACH)):  # whatever the pulses
+            break
         levels = _lobes(kept) or _modes(kept)
         if levels.significant:
             above = kept > 0.5 * (levels.low + levels.high)
