@@ -146,6 +146,20 @@ def test_even_marks_have_no_pattern(rng):
     assert np.count_nonzero(found) <= 1
 
 
+@pytest.mark.parametrize('hunting', [0.0, 0.05, 0.5])
+@pytest.mark.parametrize('clock', [1e4, 2e4])
+def test_a_slow_hunting_of_the_speed_and_the_beat_of_a_clock_are_no_wheel(hunting, clock):
+    """The speed repeats after 1170 teeth, and the ticks of 20 kHz after 117."""
+    time = np.linspace(0.0, 20.0, 200_001)
+    turned = 13.0 * time - hunting / (0.8 * np.pi) * (np.cos(0.8 * np.pi * time) - 1.0)
+    numbers = np.arange(1, int(36 * turned[-1]))
+    times = np.ceil(np.interp(numbers / 36, turned, time) * clock) / clock
+    assert not patterns(number_pulses(times))
+    found = checked(np.full((1, 1), np.nan), times[numbers % 36 != 0], rate=1.0)
+    assert values(found, 'pulses_per_revolution', 'missing_teeth') == (36, 1)
+    assert all(values(found, name)[0]['count'] == 0 for name in ('missing', 'spurious'))
+
+
 @pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'orders'), [
     (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS)])

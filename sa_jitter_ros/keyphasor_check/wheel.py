@@ -23,8 +23,10 @@ import math
 
 import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
+from sa_jitter_ros.keyphasor_check.clock import find_clock
 from sa_jitter_ros.keyphasor_check.teeth import NumberedPulses
 from sa_jitter_ros.pulses.target import index_of
+from scipy.ndimage import convolve1d
 
 _MOST_TEETH = 1200
 _FEWEST_REVOLUTIONS = 4
@@ -37,6 +39,9 @@ _MOSTLY = 0.67  # at most so many teeth are missing
 # Likelihoods hold for independent errors; those of pulses and speeds are not.
 _TEMPER = 0.3
 _CLEAR, _MOST_PATTERNS = 3.0, 4
+# What neighbours share is the motion: weights of the pulses around one.
+_AROUND = np.bartlett(43)[1:-1] / 21.0
+_ROUNDED = 0.25  # mean distance of times from the middle of their ticks, in ticks
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,9 @@ def patterns(pulses: NumberedPulses) -> list[Marking]:
     numbers, places = _longest(pulses)
     span = int(numbers[-1] - numbers[0]) + 1
     most = min(_MOST_TEETH, span // _FEWEST_REVOLUTIONS)
-    evidence = _Evidence(numbers, places)
+    ticks = find_clock(pulses.times).rate * float(np.median(pulses.pitch))
+    evidence = _Evidence(numbers, places - convolve1d(places, _AROUND, mode='nearest'),
+                         _ROUNDED / ticks if ticks else 0.0)
     even = evidence.of(1)
     gains = np.array([evidence.of(n) - even for n in range(2, most + 1)])
     found: list[Marking] = []
@@ -157,11 +164,16 @@ def _missing(seen: IntArray, span: IntArray) -> BoolArray:
 
 
 class _Evidence:
-    """What pulses with these numbers, at these places (n,) in teeth, say for numbers of teeth."""
+    """
+    What pulses with these numbers, at these places (n,) in teeth, say for numbers of teeth.
 
-    def __init__(self, numbers: IntArray, places: FloatArray) -> None:
+    A scatter below the one that is `rounding` tells nothing: ticks of a clock repeat, too.
+    """
+
+    def __init__(self, numbers: IntArray, places: FloatArray, rounding: float) -> None:
         self._numbers, self._places = numbers, places
-        self._even = _scatter(places - np.median(places))
+        self._rounding = max(rounding, 1e-9)
+        self._even = self._scatter(places - np.median(places))
 
     def of(self, teeth: int) -> float:
         """
@@ -178,7 +190,7 @@ class _Evidence:
             absent, unexpected = int((span - seen)[missing].sum()), int(seen[missing].sum())
             kept = ~missing[classes]
             classes, place = classes[kept], place[kept]
-            even = _scatter(place - np.median(place))
+            even = self._scatter(place - np.median(place))
         count = place.size
         lost = float(int(span.sum()) - self._numbers.size - absent)
         positions = lost + count
@@ -187,14 +199,13 @@ class _Evidence:
                      + absent * math.log(_ALWAYS) + unexpected * math.log(1.0 - _ALWAYS))
         mean = np.bincount(classes, place, teeth) / np.maximum(seen, 1)
         # Least absolute deviations: strays that pass for pulses say little.
-        uneven = _scatter(place - mean[classes])
+        uneven = self._scatter(place - mean[classes])
         # Gaps need not have uneven teeth between them. Pulses in them are in neither scatter: a
         # stray far from its place would speak for any gap.
         penalty = 0.5 * math.log(count)
         return _TEMPER * occupancy - 2.0 * penalty * gaps + max(
             0.0, _TEMPER * count * (even - uneven) - penalty * (teeth - gaps - 1))
 
-
-def _scatter(away: FloatArray) -> float:
-    """Return the logarithm of the mean distance of pulses (n,) from their places, in teeth."""
-    return math.log(max(float(np.abs(away).mean()), 1e-9))
+    def _scatter(self, away: FloatArray) -> float:
+        """Return the logarithm of the mean distance of pulses (n,) from their places, in teeth."""
+        return math.log(max(float(np.abs(away).mean()), self._rounding))
