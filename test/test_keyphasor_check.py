@@ -162,7 +162,8 @@ def test_a_slow_hunting_of_the_speed_and_the_beat_of_a_clock_are_no_wheel(huntin
 
 @pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'orders'), [
-    (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS)])
+    (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS),
+    *((marks, ((1.0, 1.0), (19.0, 0.6), (38.0, 0.3))) for marks in (20, 36, 60))])
 def test_lines_of_the_vibration_tell_even_marks(rng, marks, orders):
     check = checked(vibration(rng, orders=orders), tach(rng, marks)[0])
     count = check.findings['pulses_per_revolution']

@@ -155,10 +155,13 @@ def marks_evidence(lines: ToothLines | None, counts: Sequence[int]) -> dict[int,
     if lines is None or not lines.places.size:
         return log
     families = _families(lines)
+    geared = bool(np.any(on_orders(lines, 1.0)[1]))
+    strays = -math.inf if geared else len(families) * math.log(1.0 - _FOLLOWS)
     for count in counts:
         said = [_says(lines, family, count) for family in families]
         chance = sum(value for value, certain in said if not certain)
-        log[count] = sum(value for value, certain in said if certain) + min(chance, _COINCIDENCE)
+        log[count] = sum(value for value, certain in said if certain) + max(
+            min(chance, _COINCIDENCE), chance + strays)
     return {count: max([value, *(log[part] - _SYMMETRY - math.log(count / part)
                                  for part in counts if count % part == 0 and part < count)])
             for count, value in log.items()}
