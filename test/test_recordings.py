@@ -826,6 +826,17 @@ def test_broken_csv(tmp_path, text, options, message):
         read(tmp_path / 'bad.csv', **options).read()
 
 
+def test_csv_columns_of_one_name_are_told_by_their_numbers(tmp_path):
+    path = tmp_path / 'twice.csv'
+    path.write_text('time,acc,acc\n' + ''.join(f'{k / 10},{k},{-k}\n' for k in range(9)))
+    for tach in ('2', 'acc 2'):
+        found = read(path, tach_channel=tach)
+        assert found.channel_names == ('acc',)
+        assert found.read()[0] == pytest.approx(-found.read_tach())
+        assert found.read_tach()[1] == -1.0
+    assert read(path).channel_names == ('acc', 'acc 2')
+
+
 def test_csv_that_ends_in_the_middle_of_a_row_is_read_up_to_there(tmp_path):
     text = ''.join(f'{k / 10:.1f},{k},{-k}\n' for k in range(9))
     for end in (' ', '0.9', '0.9,1'):

@@ -66,7 +66,8 @@ class CsvLayout:
 
     `pattern` are the columns that are numbers in most rows, `fit` how many such rows there are,
     and whether one of them has no text. With a pattern there are: `skipped` lines above the
-    samples, `names` of the columns (their numbers without a line of names), `units` ('' where
+    samples, `names` of the columns (their numbers without a line of names, or behind a name that
+    another has), `units` ('' where
     unknown), columns that hold samples (`used`) or none (`idle`, with the reason), the column of
     times (`time`, None for none), what was left out (`remarks`) and what the preamble says of the
     sampling rate (`hint`).
@@ -111,6 +112,8 @@ class CsvLayout:
         self.remarks = [f'{len(preamble)} line{"s" * (len(preamble) > 1)} above the table '
                         'skipped: no samples'] * bool(preamble)
         self.hint = _hint(lines[:max(start, _HINTS)])
+        self.names = [f'{name} {k}' if name and name in self.names[:k] else name
+                      for k, name in enumerate(self.names)]
 
     def plain(self, line: str) -> str:
         """Return a line with decimal points and without groups of digits."""
