@@ -222,7 +222,7 @@ def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, m
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'ratio': 'x'}, 'ratio of type'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'pulses_per_revolution': 1.5}, 'whole number'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'channel_names': 5}, 'give text'),
-    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach': np.ones(3)}, 'tach_rate'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach': np.ones(2)}, 'tach_rate'),
     ({'vibration': np.ones((2, 9)), 'sample_rate': 1.0, 'tach': np.ones((3, 9)),
       'tach_rate': 1.0}, 'tach of 3 rows for 2'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach_count': [1, 2]}, 'tach_rate'),
@@ -616,7 +616,7 @@ def test_csv_whose_times_are_not_steady_is_refused_with_the_given_rate(tmp_path)
     times = np.arange(1000) / 100.0
     times[500] += 0.006
     (tmp_path / 'rig.csv').write_text('time,a\n' + '\n'.join(f'{t:.4f},1' for t in times))
-    with pytest.raises(RecordingError, match=r'row 500: time 5.006 s does not fit'):
+    with pytest.raises(RecordingError, match=r'row 500: time 5.006 s is 0.016 s behind the'):
         read(tmp_path / 'rig.csv', sample_rate=100.0).read()
 
 
@@ -810,7 +810,7 @@ def test_csv_with_a_bad_row_is_not_shortened(tmp_path, place):
     ('a,b\n1,2\n5,3\n', {}, 'no time column among a, b'),
     ('time,a\n1,2\n', {}, '1 row of samples: give more, or the sample_rate'),
     ('time,a\n0,1\n0,2\n', {}, 'sort the rows by time'),
-    ('time,a\n0,1\n1,2\n5,3\n6,4\n', {}, 'split the file at its gaps'),
+    ('time,a\n0,1\n1,2\n5,3\n6,4\n', {}, 'split the file at gaps'),
     ('time,a\nx,1\n', {}, 'no time column among time, a: .*; time holds text'),
     ('a,b\n1,2\n3\n', {'sample_rate': 1.0}, 'rows 0 to 2'),
     ('a,b\n1,2\n3,x\n', {'sample_rate': 1.0}, 'rows 0 to 2'),
@@ -835,6 +835,40 @@ def test_csv_columns_of_one_name_are_told_by_their_numbers(tmp_path):
         assert found.read()[0] == pytest.approx(-found.read_tach())
         assert found.read_tach()[1] == -1.0
     assert read(path).channel_names == ('acc', 'acc 2')
+
+
+def test_csv_gaps_are_named(tmp_path):
+    path = tmp_path / 'gap.csv'
+    for rows in ([*range(2000), *range(2600, 6000)], [*range(2000), *range(6000)]):
+        path.write_text('time,acc\n' + ''.join(f'{k / 5e3},{k % 7}\n' for k in rows))
+        with pytest.raises(RecordingError, match=r'row 2000: time \S+ s is -?0\.\d+ s behind '
+                                                 r'the row before, most 0\.0002 s: split'):
+            read(path)
+
+
+def test_csv_tach_in_few_rows_is_remarked(tmp_path):
+    path = tmp_path / 'slow.csv'
+    path.write_text('time,acc,tach\n' + ''.join(
+        f'{k / 5e3},{k % 7},{"" if k % 5 else k % 3}\n' for k in range(500)))
+    assert read(path, tach_channel='tach').remarks == ('column tach is empty in most rows',)
+
+
+def test_tach_without_a_rate_is_sampled_with_a_vibration_of_the_same_length(tmp_path):
+    for length in (500, 400):
+        np.savez(tmp_path / 'a.npz', vibration=np.zeros((1, 500)), sample_rate=5e3,
+                 tach=np.ones(length))
+        if length == 400:
+            with pytest.raises(RecordingError, match='without tach_rate'):
+                read(tmp_path / 'a.npz')
+        else:
+            assert read(tmp_path / 'a.npz').tach_rate == 5e3
+            assert 'taken as sampled with it' in read(tmp_path / 'a.npz').remarks[0]
+
+
+def test_a_vibration_without_samples_is_named(tmp_path):
+    np.savez(tmp_path / 'a.npz', vibration=np.zeros((1, 0)), sample_rate=5e3)
+    with pytest.raises(RecordingError, match=r'shape \(1, 0\): give samples, channel x sample'):
+        read(tmp_path / 'a.npz')
 
 
 def test_csv_that_ends_in_the_middle_of_a_row_is_read_up_to_there(tmp_path):
@@ -1320,7 +1354,7 @@ def test_times_rounded_to_more_than_a_sample_tell_the_rate(tmp_path, decimals):
     with pytest.raises(RecordingError, match='leave it out'):
         read(path, sample_rate=2100.0)
     path.write_text('\n'.join(['time,acceleration', *rows[:4000], *rows[4200:]]), encoding='utf-8')
-    with pytest.raises(RecordingError, match='split the file at its gaps'):
+    with pytest.raises(RecordingError, match='split the file at gaps'):
         read(path)
 
 

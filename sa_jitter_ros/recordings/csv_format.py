@@ -65,8 +65,8 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             f'no time column among {", ".join(names)}: give its name as time_column, '
             f'or give the sample_rate{layout.hint}{hints}')
     remarks = (*layout.remarks, *left_out, *(
-        f'column {names[k] or k} {reason} and is left out'
-        for k, reason in layout.idle.items() if k not in (*times, *columns)))
+        f'column {names[k] or k} {reason}{" and is left out" * (k not in columns)}'
+        for k, reason in layout.idle.items() if k not in times))
     return channel_map.select(Recording(
         ArraySource(table[:, :len(columns)].T), rate, start_time=start_time, remarks=remarks,
         channel_names=tuple(names[column] for column in columns),
@@ -96,12 +96,12 @@ def _clock(layout: CsvLayout, values: FloatArray, sample_rate: float | None
     elif not abs((end - start) * rate - count) < 1.0 + rounding * rate:
         raise RecordingError(f'sample_rate {rate} Hz given, but the times of the file say '
                              f'{measured} Hz: leave it out')
-    astray = np.flatnonzero(~(abs((times - start) * rate - index) < 0.5 + rounding * rate))
-    if astray.size:
-        row = int(astray[0])
+    if not np.all(abs((times - start) * rate - index) < 0.5 + rounding * rate):
+        usual = max(float(np.median(steps)), rounding)
+        row = int(np.argmax(np.abs(steps - usual))) + 1
         raise RecordingError(
-            f'row {row}: time {times[row]} s does not fit a constant rate of {rate:g} Hz from '
-            f'{start} s: split the file at its gaps; of edges, save pulse_times in a .npz')
+            f'row {row}: time {times[row]} s is {steps[row - 1]:.6g} s behind the row before, '
+            f'most {usual:.6g} s: split the file at gaps; of edges, save pulse_times in a .npz')
     return start, rate
 
 

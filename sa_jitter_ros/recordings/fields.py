@@ -177,8 +177,7 @@ def recording_from_fields(arrays: Arrays, *, acquisition: int, given: Mapping[st
     if 'sample_rate' not in values:
         raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz to the '
                              'file, or give sample_rate')
-    if ('tach' in sources and tach is not None and 'tach_rate' not in values
-            and tach.shape[-1] == vibration.shape[-1]):
+    if tach is not None and 'tach_rate' not in values and len(tach.T) == len(vibration.T):
         values['tach_rate'] = values['sample_rate']
         remarks.append('the tach waveform has no tach_rate and as many samples as the vibration: '
                        'it is taken as sampled with it')
@@ -255,8 +254,8 @@ def _samples(name: str, array: Array) -> Array:
     array = _real(name, array)
     if array.ndim == 1 or (array.ndim == 2 and array.shape[1] == 1):
         array = array.reshape(1, -1)
-    if array.ndim != 2:
-        raise RecordingError(f'{name} of shape {array.shape}: give channel x sample')
+    if array.ndim != 2 or not array.size:
+        raise RecordingError(f'{name} of shape {array.shape}: give samples, channel x sample')
     if array.shape[0] > array.shape[1]:
         raise RecordingError(
             f'{name} of shape {array.shape}: more channels than samples; store channel x sample '

@@ -232,7 +232,8 @@ class _Reader:
             element = self._element(data, at, matrix.stop)
             cell = self._matrix(data, element)
             if cell.kind != _CHAR:
-                raise RecordingError(f'{matrix.name} has a cell that is not text: give text only')
+                raise RecordingError(f'{matrix.name} has a cell that is no text: save samples in '
+                                     'variables of their own, or as fields of a struct')
             yield ''.join(self._text(data, cell).tolist())
             at = self._after(element, at)
 
