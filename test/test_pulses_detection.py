@@ -12,6 +12,8 @@
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import warnings
+
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
@@ -564,6 +566,24 @@ def test_the_last_bit_of_a_machine_that_stands_is_no_pulse(speed, rate, turning,
 def test_pulses_of_a_digital_input_may_be_short(level, speed, width):
     wave = level * (np.arange(10_000) % round(1000.0 / speed) < width)
     assert detect(wave, rate=1000.0)[0].size == np.count_nonzero(np.diff(wave) > 0.0)
+
+
+@pytest.mark.parametrize('each', [2.2, 2.5, 3.5, 4.0])
+def test_lines_of_an_encoder_may_have_few_samples(each):
+    turns = (np.arange(40_000) + 0.3) / each
+    lines = int(turns[-1])
+    assert detect(np.where(turns % 1.0 < 0.5, 5.0, 0.0), rate=50e3)[0].size == (
+        pytest.approx(lines, abs=1))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter('always')
+        found = sa.detect_pulses(np.sin(2.0 * np.pi * turns), 50e3)
+    if each > 3.0:
+        assert not said
+        assert found.size == pytest.approx(lines, abs=1)
+    else:
+        text = str(said[0].message)
+        assert 'samples a pulse, of which some may be lost: sample it at ' in text
+        assert 45e3 < float(text.split()[-4]) * each / 3.0 < 65e3
 
 
 def test_a_cable_that_is_unplugged_gives_no_pulses(rng):

@@ -50,7 +50,8 @@ _BEYOND_NOISE, _WIDEST = 4.0, 0.2
 _FEWEST = 40  # samples from which levels are learnt: ten intervals of four
 # The longest window, s and samples: two pulses of a shaft at 0.05 Hz, or 32 MB.
 _LONGEST, _MOST = 64.0, 1 << 22
-_LOUDER = 1.5  # change of the noise that is another one
+# Change of the noise that is another one; samples a pulse, of fewer two may be in its band.
+_LOUDER, _SPARSE = 1.5, 3.0
 # Part of a lobe that a signal must pass on either side of the resting level.
 _PASSED = 0.4
 # Share of the samples above the middle from which on pulses are taken for negative.
@@ -183,7 +184,8 @@ class KeyphasorDetector:
             self._origin, self._index = start_time, 0
         self._samples += block.size
         found = []
-        window = self._least() if self._learns else max(block.size, 1)
+        window = max(round(self._learning_time * sample_rate), _FEWEST) if self._learns else max(
+            block.size, 1)
         while block.size:
             piece, block = np.split(block, [window - self._held % window])
             part = self._origin, self._index, self._sign * piece
@@ -202,12 +204,8 @@ class KeyphasorDetector:
         size, found = self._held, _NONE
         while size and self._levels is None:
             found = self._learn(size, whole=size < self._held)
-            size = size // 2 if size > self._least() else 0
+            size = size // 2 if size > max(self._learning_time * self._rate, _FEWEST) else 0
         return found
-
-    def _least(self) -> int:
-        """Return the number of samples of the shortest window."""
-        return max(round(self._learning_time * self._rate), _FEWEST)
 
     def _checked(self, samples: npt.ArrayLike, start_time: float, sample_rate: float
                  ) -> FloatArray:
@@ -408,7 +406,7 @@ def detect_pulses(
 
     The first sample is at `start_time`, `sample_rate` in Hz; the other keywords are those of
     `KeyphasorDetector`. Samples that are NaN or infinite are a gap, across which no pulse is
-    found. If there is no pulse at all, or there are spikes, a `DataWarning` says so. Raises
+    found. A `DataWarning` names spikes, pulses of few samples, and if there is none. Raises
     `ParameterError` for options and `SignalError` for an array or a rate that cannot be used.
 
     One pulse per revolution of a shaft at 25 Hz. With `interpolate=False` each pulse has the time
@@ -435,14 +433,15 @@ def detect_pulses(
         detector.update(samples, start_time, sample_rate)  # raises the error
     block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
     pulses = pulses_in_blocks(detector, [block])
-    if spikes := spikes_text(detector.state.spikes):
-        warnings.warn(spikes, DataWarning, stacklevel=2)
+    state, said = detector.state, [spikes_text(detector.state.spikes)]
     if not pulses.size:
-        state = detector.state
-        why = (f'its levels are {state.low:g} and {state.high:g}, the threshold is '
-               f'{state.threshold:g}; set a threshold between the levels'
-               if np.isfinite(state.low) else
-               f'its {samples.size} samples do not show two levels; check that the shaft turns '
-               'and that the sensor is connected')
-        warnings.warn(f'the keyphasor waveform has no pulses: {why}', DataWarning, stacklevel=2)
+        said.append('the keyphasor waveform has no pulses: ' + (
+            f'its levels are {state.low:g} and {state.high:g}, the threshold is '
+            f'{state.threshold:g}; set it between them' if np.isfinite(state.low) else
+            f'its {samples.size} samples have one level; check that the shaft turns, and cables'))
+    elif (each := sample_rate * float(np.quantile(np.diff(pulses, prepend=-1e12), .25))) < _SPARSE:
+        said.append(f'the keyphasor waveform has {each:.2g} samples a pulse, of which some may be '
+                    f'lost: sample it at {_SPARSE * sample_rate / each:.0f} Hz or more')
+    for text in filter(None, said):
+        warnings.warn(text, DataWarning, stacklevel=2)
     return pulses

@@ -214,7 +214,9 @@ def _changes_as_pulses(levels: StateLevels, samples: FloatArray, *, coarse: bool
     """
     above = samples > (0.5 * (levels.middle + levels.high) if levels.steep else levels.middle)
     begin, end = _runs(above if 2 * np.count_nonzero(above) < above.size else ~above)
-    if _regular(begin, 0.5 * _EVEN if coarse else _EVEN):
+    # Of few intervals those of noise are even by chance.
+    chance = 0.5 * coarse * math.sqrt(_INTERVALS / max(begin.size, 1))
+    if _regular(begin, _EVEN * (1.0 - chance)):
         return True
     return bool(np.mean(end - begin) > _LONG)
 
