@@ -10,10 +10,10 @@
 
 """From keyphasor waveform to pulse times: exact crossings, any cutting, real tachos, bad input."""
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import warnings
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
