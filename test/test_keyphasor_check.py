@@ -146,6 +146,13 @@ def test_even_marks_have_no_pattern(rng):
     assert np.count_nonzero(found) <= 1
 
 
+def test_the_clock_of_pulses_makes_no_unsteady_speed(rng):
+    check = checked(vibration(rng, orders=((1.0, 0.3), (60.0, 1.0), (90.0, 0.5))),
+                    tach(rng, clock=3e3)[0])
+    assert {'quantised', 'jitter'} <= codes(check)
+    assert 'unsteady_speed' not in codes(check)
+
+
 @pytest.mark.parametrize('hunting', [0.0, 0.05, 0.5])
 @pytest.mark.parametrize('clock', [1e4, 2e4])
 def test_a_slow_hunting_of_the_speed_and_the_beat_of_a_clock_are_no_wheel(hunting, clock):
@@ -583,7 +590,7 @@ def test_pulse_errors_below_their_own_uncertainty_show_no_jitter(rng, scatter, s
 
 def test_cost_of_a_run_up_is_what_the_straight_angle_law_loses():
     """At a speed that grows by 2 % in each revolution, within which it is ahead by its half."""
-    fitted = SimpleNamespace(speed=25.0 * 1.02 ** np.arange(50.0),
+    fitted = SimpleNamespace(speed=25.0 * 1.02 ** np.arange(50.0), mean_speed=40.0,
                              pattern=SimpleNamespace(present=1))
     found, = _of_speed(fitted, 1.0, [20.0, 40.0], None)
     u = (np.arange(1000) + 0.5) / 1000

@@ -55,7 +55,8 @@ def costs(findings: Mapping[str, Checked], fitted: FittedPulses, times: FloatArr
     ratio = float(findings['ratio'].value or 1.0)
     return [*_of_pulses(fitted, orders), *_of_marks(fitted, ratio, orders),
             *_of_jitter(findings, ratio, orders),
-            *_of_speed(fitted, ratio, orders, from_marks), *_of_changes(np.unique(times))]
+            *_of_speed(fitted, ratio, orders, from_marks, findings['jitter_std'].value or 0.0),
+            *_of_changes(np.unique(times))]
 
 
 def _of_pulses(fitted: FittedPulses, orders: Sequence[float]) -> list[Warn]:
@@ -156,7 +157,7 @@ def _of_errors(error: FloatArray, ratio: float, orders: Sequence[float]) -> Floa
 
 
 def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float],
-              from_marks: Losses | None) -> list[Warn]:
+              from_marks: Losses | None, jitter: float = 0.0) -> list[Warn]:
     """Return what a speed costs that changes within a revolution, with the linear angle law."""
     if from_marks is not None:
         turn, mark = from_marks
@@ -165,10 +166,10 @@ def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float],
             '1, so that trigger cycles go from mark to mark; no order here then loses more than '
             f'{100.0 * max(mark):.2g} % by it, whatever the angle_law',
             _percent(orders, turn.tolist()))]
-    speed = fitted.speed[::max(1, fitted.pattern.present)]
-    if speed.size < 4:
-        return []
-    steady = _steady_change(speed)
+    steady = _steady_change(fitted.speed[::max(1, fitted.pattern.present)])
+    # Each change holds half of four pulse errors (s): as much is not of the speed.
+    size = math.sqrt(steady @ steady / max(steady.size, 1))
+    steady *= math.sqrt(max(0.0, 1.0 - (fitted.mean_speed * jitter / max(size, 1e-300))**2))
     loss = _of_errors(np.multiply.outer(steady, _BEND), ratio, orders)
     if max(loss) < _UNSTEADY:
         return []
