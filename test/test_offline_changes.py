@@ -10,6 +10,7 @@
 
 """Has the machine changed, over recordings of days: what is found, and what a bad day costs."""
 
+from itertools import pairwise
 import json
 import signal
 
@@ -100,9 +101,15 @@ def test_the_figure_shows_what_changed_first(weeks, tmp_path):
     page = (tmp_path / 'page.html').read_text()
     assert '<p class="verdict unexplained">The machine has changed in 9 recordings' in page
     assert page.count('<img alt="Changes"') == 1
-    first, *others = changes_figure(changes).axes
+    figure = changes_figure(changes)
+    first, *others = figure.axes
     assert first.get_title(loc='left').startswith('bearing order 4.87 of shaft, channel 0: +')
     assert len(others) == 5
+    for _ in range(2):  # the layout moves the labels
+        figure.savefig(tmp_path / 'labels.png')
+    places = [axes.yaxis.label.get_window_extent() for axes in figure.axes]
+    assert any('unit unknown' in axes.get_ylabel() for axes in others)
+    assert all(below.y1 < above.y0 for above, below in pairwise(places))
 
 
 def test_limits_of_days_are_passed_beside_the_changes(weeks, tmp_path):

@@ -113,7 +113,7 @@ def _draw(axes: Axes, changes: Changes, key: Key, trends: Mapping[str, Array]) -
         title = change.words(changes.since(change)).partition(';')[0]
     axes.set_title(title, fontsize='small', loc='left')
     units = changes.recordings[0].units
-    known = f' [{units[channel] or "unit unknown"}]' if channel < len(units) else ''
+    known = f'\n[{units[channel] or "unit unknown"}]' if channel < len(units) else ''
     quantity = {'order': f'amplitude{known}', 'bearing': 'depth of\nmodulation'}.get(
         kind, f'{name}{known}' if name in IN_UNIT else name.replace('_', ' '))
     axes.set_ylabel(quantity, fontsize='small')
