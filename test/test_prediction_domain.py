@@ -134,7 +134,7 @@ def test_predictions_with_effects_are_those_of_drawn_averages(seed):
     ({'correlated_jitter': {'std': 2.6e-4, 'correlation': 0.9}}, 200),
     ({'correlated_jitter': {'std': 3.3e-4, 'correlation': 0.9}}, 200),
     ({'clock_skew': {'skew': 4.5e-4}}, 41)])
-def test_quantiles_of_pulses_that_remember_each_other_or_drift_have_their_ranks(effects, cycles, rng):
+def test_quantiles_of_pulses_that_are_not_independent_have_their_ranks(effects, cycles, rng):
     skew = effects.get('clock_skew', {'skew': 0.0})['skew']
     values = effects.get('correlated_jitter', {'std': 0.0, 'correlation': 0.0})
     found = sa.predict(keyphasor_rate=5e3, trigger_speed=20.0, orders=[50.0], effects=effects,
