@@ -18,7 +18,9 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses import detection
 from sa_jitter_ros.pulses.detection import KeyphasorDetector
+from sa_jitter_ros.pulses.threshold import state_levels
 from scipy.signal import butter, lfilter
 
 RATE = 10_000.0
@@ -625,3 +627,15 @@ def test_reluctance_of_a_wheel_with_missing_teeth_has_the_time_of_each_tooth(
     near = np.abs(pulses - times[np.searchsorted(0.5 * (times[1:] + times[:-1]), pulses)])
     assert pulses.size == pytest.approx(times.size, abs=2)
     assert np.quantile(near, 0.999) < 0.01 / (teeth * min(speeds))
+
+
+def test_long_windows_are_looked_at_in_part(rng, monkeypatch):
+    """A stopped machine at 200 kHz does not hold up what takes its samples."""
+    sizes = []
+    monkeypatch.setattr(detection, 'state_levels', lambda samples, known=None: (
+        sizes.append(samples.size), state_levels(samples, known))[1])
+    detector = KeyphasorDetector()
+    for start in range(14):
+        detector.update(0.01 * rng.standard_normal(200_000), float(start), 200e3)
+    assert len(sizes) > 20
+    assert max(sizes) <= 1 << 17

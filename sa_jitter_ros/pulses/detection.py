@@ -19,6 +19,7 @@ keyphasor.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+import math
 from typing import Literal
 import warnings
 
@@ -50,6 +51,7 @@ _BEYOND_NOISE, _WIDEST = 4.0, 0.2
 _FEWEST = 40  # samples from which levels are learnt: ten intervals of four
 # The longest window, s and samples: two pulses of a shaft at 0.05 Hz, or 32 MB.
 _LONGEST, _MOST = 64.0, 1 << 22
+_READ = 1 << 17  # samples of a window that are looked at: slow pulses are in many
 # Change of the noise that is another one; samples a pulse, of fewer two may be in its band.
 _LOUDER, _SPARSE = 1.5, 3.0
 # Part of a lobe that a signal must pass on either side of the resting level.
@@ -244,6 +246,7 @@ class KeyphasorDetector:
     def _learn(self, size: int, *, whole: bool) -> FloatArray:
         """Learn the levels from the last samples; return the pulses that waited for them."""
         window = np.concatenate([part for *_, part in _last(self._window, size)])
+        window = window[::math.ceil(size / max(_READ, self._learning_time * self._rate))]
         known = self._levels
         levels = state_levels(window[~known.spikes(window)] if known else window, known)
         if known and not levels.significant:  # larger pulses, perhaps
