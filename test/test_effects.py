@@ -220,6 +220,10 @@ def test_another_clock_replaces_the_jitter_of_the_declared_rate(rate):
                                   alone.mean_attenuation)
 
 
+def test_ticks_that_are_lost_in_a_declared_one_replace_nothing():
+    assert not make_effect('keyphasor_quantisation', clock_rate=1e7).replaces_jitter(MODEL)
+
+
 @pytest.mark.parametrize('rate', [5_000.0, 20_000.0])
 def test_a_clock_comes_on_top_of_jitter_that_is_declared_as_such(rate):
     effect = make_effect('keyphasor_quantisation', clock_rate=rate)

@@ -773,6 +773,9 @@ sys.exit(main())
 """
 
 
+NO_NOHUP = 'import signal\nsignal.signal(signal.SIGHUP, signal.SIG_DFL)\n'
+
+
 def run(environment, *arguments, before=''):
     """Start the node as a process."""
     return subprocess.Popen(
@@ -786,7 +789,7 @@ def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, t
     file = tmp_path / 'averager.yaml'
     file.write_text('/**:\n  ros__parameters:\n    trigger_cycles: 12\n    shaft:\n'
                     '      ratio: 2\n      orders: [1, 38]\n')
-    process = run(process_environment, '--params-file', str(file))
+    process = run(process_environment, '--params-file', str(file), before=NO_NOHUP)
     assert process.stdout.readline() == 'spinning\n'
     process.send_signal(number)
     _, errors = process.communicate(timeout=600)

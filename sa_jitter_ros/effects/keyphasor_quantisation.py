@@ -12,8 +12,8 @@
 Keyphasor quantisation: pulse times on the grid of a clock, to which their errors are locked.
 
 A clock of the declared keyphasor rate is the cause of the declared jitter: its errors replace the
-independent ones. So do those of any clock, if the declared jitter is that of the rate; jitter that
-is declared as such comes on top. Errors of a steady machine repeat, p_{k+1} = p_k - T f mod 1, so
+independent ones. So do those of any clock whose ticks are not lost in a declared one, if the
+declared jitter is that of the rate; jitter that is declared as such comes on top. Errors of a steady machine repeat, p_{k+1} = p_k - T f mod 1, so
 that the mean over all starting phases need not be what one average shows: where pulses were
 measured, the prediction is made for their own phases.
 """
@@ -86,7 +86,8 @@ class KeyphasorQuantisation(Effect):
     def replaces_jitter(self, model: DeclaredModel) -> bool:
         """Return whether this clock is the declared one, or is read in its place."""
         other = model.jitter_std or model.jitter_distribution == 'table'
-        return not other or self.is_declared(model)
+        seen = Clock(self.clock_rate, 0.0).visible(model.keyphasor_rate)
+        return (seen and not other) or self.is_declared(model)
 
     def is_declared(self, model: DeclaredModel) -> bool:
         """Return whether this clock is the declared one."""

@@ -112,7 +112,8 @@ class CsvLayout:
         self.remarks = [f'{len(preamble)} line{"s" * (len(preamble) > 1)} above the table '
                         'skipped: no samples'] * bool(preamble)
         self.hint = _hint(lines[:max(start, _HINTS)])
-        self.names = [f'{name} {k}' if name and name in self.names[:k] else name
+        first = {name: k for k, name in reversed([*enumerate(self.names)])}
+        self.names = [f'{name} {k}' if name and first[name] < k else name
                       for k, name in enumerate(self.names)]
 
     def plain(self, line: str) -> str:
