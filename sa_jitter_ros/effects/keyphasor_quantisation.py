@@ -13,9 +13,10 @@ Keyphasor quantisation: pulse times on the grid of a clock, to which their error
 
 A clock of the declared keyphasor rate is the cause of the declared jitter: its errors replace the
 independent ones. So do those of any clock whose ticks are not lost in a declared one, if the
-declared jitter is that of the rate; jitter that is declared as such comes on top. Errors of a steady machine repeat, p_{k+1} = p_k - T f mod 1, so
-that the mean over all starting phases need not be what one average shows: where pulses were
-measured, the prediction is made for their own phases.
+declared jitter is that of the rate; jitter that is declared as such comes on top. Errors of a
+steady machine repeat, p_{k+1} = p_k - T f mod 1, so that the mean over all starting phases need
+not be what one average shows: where pulses were measured, the prediction is made for their own
+phases.
 """
 
 from collections.abc import Mapping
