@@ -222,7 +222,7 @@ def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, m
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'ratio': 'x'}, 'ratio of type'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'pulses_per_revolution': 1.5}, 'whole number'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'channel_names': 5}, 'give text'),
-    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach': np.ones(2)}, 'tach_rate'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach': np.ones(3)}, 'tach_rate'),
     ({'vibration': np.ones((2, 9)), 'sample_rate': 1.0, 'tach': np.ones((3, 9)),
       'tach_rate': 1.0}, 'tach of 3 rows for 2'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach_count': [1, 2]}, 'tach_rate'),
@@ -851,18 +851,6 @@ def test_csv_tach_in_few_rows_is_remarked(tmp_path):
     path.write_text('time,acc,tach\n' + ''.join(
         f'{k / 5e3},{k % 7},{"" if k % 5 else k % 3}\n' for k in range(500)))
     assert read(path, tach_channel='tach').remarks == ('column tach is empty in most rows',)
-
-
-def test_tach_without_a_rate_is_sampled_with_a_vibration_of_the_same_length(tmp_path):
-    for length in (500, 400):
-        np.savez(tmp_path / 'a.npz', vibration=np.zeros((1, 500)), sample_rate=5e3,
-                 tach=np.ones(length))
-        if length == 400:
-            with pytest.raises(RecordingError, match='without tach_rate'):
-                read(tmp_path / 'a.npz')
-        else:
-            assert read(tmp_path / 'a.npz').tach_rate == 5e3
-            assert 'taken as sampled with it' in read(tmp_path / 'a.npz').remarks[0]
 
 
 def test_a_vibration_without_samples_is_named(tmp_path):

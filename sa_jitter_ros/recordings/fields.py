@@ -177,7 +177,8 @@ def recording_from_fields(arrays: Arrays, *, acquisition: int, given: Mapping[st
     if 'sample_rate' not in values:
         raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz to the '
                              'file, or give sample_rate')
-    if tach is not None and 'tach_rate' not in values and len(tach.T) == len(vibration.T):
+    if ('tach' in sources and tach is not None and 'tach_rate' not in values
+            and tach.shape[-1] == vibration.shape[-1]):
         values['tach_rate'] = values['sample_rate']
         remarks.append('the tach waveform has no tach_rate and as many samples as the vibration: '
                        'it is taken as sampled with it')
