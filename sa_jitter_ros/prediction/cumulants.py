@@ -31,7 +31,7 @@ _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stay
 _TABLE_NODES, _SPREADS = (_NODES, 12, 24), (0.4, 0.75)
 # Variance of a cycle over its squared mean, up to which it is a mean to expand about: by errors of
 # any distribution, and by normal ones.
-_CLEAR, _CLEAR_NORMAL = 8.0, 1e6
+_CLEAR, _CLEAR_NORMAL = 8.0, 1e4
 _MOST_BLOCKS = 64
 _PAIR_NODES = 32
 # Places in a cycle whose phasors superpose, and of all that meet; share of the variance forgotten.
