@@ -132,7 +132,6 @@ def test_predictions_with_effects_are_those_of_drawn_averages(seed):
     ({'correlated_jitter': {'std': 8e-5, 'correlation': -0.7}}, 50),
     ({'correlated_jitter': {'std': 6e-5, 'correlation': -0.7}}, 140),
     ({'correlated_jitter': {'std': 2.6e-4, 'correlation': 0.9}}, 200),
-    ({'correlated_jitter': {'std': 3.3e-4, 'correlation': 0.9}}, 200),
     ({'clock_skew': {'skew': 4.5e-4}}, 41)])
 def test_quantiles_of_pulses_that_are_not_independent_have_their_ranks(effects, cycles, rng):
     skew = effects.get('clock_skew', {'skew': 0.0})['skew']
