@@ -145,7 +145,7 @@ class KeyphasorDetector:
         self._decided = self._polarity != 'auto'
         self._rate, self._origin, self._index = 0.0, np.nan, 0
         self._window: list[Piece] = []
-        self._held = 0  # samples in the window
+        self._held = self._shortest = 0  # samples in the window, and in one of `learning_time`
         self._levels: StateLevels | None = None
         self._confirmed = False
         self._pending: StateLevels | None = None
@@ -162,7 +162,7 @@ class KeyphasorDetector:
         """Return the state levels and the counts so far."""
         levels = self._levels or StateLevels(np.nan, np.nan, significant=False)
         low, high = sorted((self._sign * levels.low, self._sign * levels.high))
-        waiting = 0 if self._levels else sum(part.size for *_, part in self._window)
+        waiting = 0 if self._levels else self._held
         return KeyphasorState(
             low=low, high=high, threshold=self._sign * self._threshold(levels),
             samples=self._samples, waiting=waiting, pulses=self._pulses,
@@ -180,14 +180,14 @@ class KeyphasorDetector:
         :raises SignalError: wrong shape, not finite, or another sample rate than before.
         """
         block = self._checked(samples, start_time, sample_rate)
-        self._rate = sample_rate
+        self._rate, self._shortest = sample_rate, max(
+            round(self._learning_time * sample_rate), _FEWEST)
         if not abs(start_time - (self._origin + self._index / sample_rate)) <= 0.5 / sample_rate:
             self._gaps += bool(np.isfinite(self._origin))
             self._origin, self._index = start_time, 0
         self._samples += block.size
         found = []
-        window = max(round(self._learning_time * sample_rate), _FEWEST) if self._learns else max(
-            block.size, 1)
+        window = self._shortest if self._learns else max(block.size, 1)
         while block.size:
             piece, block = np.split(block, [window - self._held % window])
             part = self._origin, self._index, self._sign * piece
@@ -206,7 +206,7 @@ class KeyphasorDetector:
         size, found = self._held, _NONE
         while size and self._levels is None:
             found = self._learn(size, whole=size < self._held)
-            size = size // 2 if size > max(self._learning_time * self._rate, _FEWEST) else 0
+            size = size // 2 if size > self._shortest else 0
         return found
 
     def _checked(self, samples: npt.ArrayLike, start_time: float, sample_rate: float
@@ -246,7 +246,7 @@ class KeyphasorDetector:
     def _learn(self, size: int, *, whole: bool) -> FloatArray:
         """Learn the levels from the last samples; return the pulses that waited for them."""
         window = np.concatenate([part for *_, part in _last(self._window, size)])
-        window = window[::math.ceil(size / max(_READ, self._learning_time * self._rate))]
+        window = window[::math.ceil(size / max(_READ, self._shortest))]
         known = self._levels
         levels = state_levels(window[~known.spikes(window)] if known else window, known)
         if known and not levels.significant:  # larger pulses, perhaps
