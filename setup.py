@@ -33,20 +33,17 @@ COMMANDS = (
 
 def scripts():
     """
-    Return the console scripts: name to module.
+    Return the names of the console scripts, with what each of them starts.
 
     colcon and Debian packages call the command `install` or `develop` and put scripts where only
     `ros2 run` looks (setup.cfg). pip builds a wheel, whose scripts are on everybody's PATH: each
     has the prefix `sa_jitter_`, and a short name beside it unless that is a common word.
     """
-    modules = {
-        **{name: f'{NAME}.nodes.{name}' for name in NODES},
-        **{name: f'{NAME}.commands.{name}' for name in COMMANDS},
-    }
+    names = (*NODES, *COMMANDS)
     if {'develop', 'install'}.intersection(sys.argv):
-        return modules
-    prefixed = {f'sa_jitter_{name}': module for name, module in modules.items()}
-    return prefixed | {name: module for name, module in modules.items() if '_' in name}
+        return {name: name for name in names}
+    return {f'sa_jitter_{name}': name for name in names} | {
+        name: name for name in names if '_' in name}
 
 
 setup(
@@ -108,6 +105,7 @@ setup(
     },
     zip_safe=True,
     entry_points={
-        'console_scripts': [f'{name} = {module}:main' for name, module in scripts().items()],
+        'console_scripts': [f'{script} = {NAME}.start:{name}'
+                            for script, name in scripts().items()],
     },
 )

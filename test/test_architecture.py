@@ -75,6 +75,7 @@ CORE = {
 ROOMS = {
     **CORE,
     '': {'numpy', *CORE},
+    'start': set(),  # it loads what it starts
     'nodes': {'pytest'} | SCIENCE | CORE.keys(),
     'commands': {'matplotlib', 'nodes'} | SCIENCE | CORE.keys(),
 }

@@ -25,6 +25,7 @@ import sysconfig
 
 import pytest
 import sa_jitter_ros
+from sa_jitter_ros import start
 import setuptools
 from test_architecture import is_ros, MODULES, needs
 
@@ -56,8 +57,8 @@ def setup_called(*arguments):
 def scripts_of(keywords_of_setup):
     """Return the console scripts: name to module."""
     lines = keywords_of_setup['entry_points']['console_scripts']
-    entries = (line.split(' = ') for line in lines)
-    return {name: target.removesuffix(':main') for name, target in entries}
+    entries = (line.split(f' = {NAME}.start:') for line in lines)
+    return {script: f'{NAME}.{getattr(start, name).args[0]}' for script, name in entries}
 
 
 @pytest.fixture(scope='module')
@@ -173,7 +174,7 @@ def test_pip_installed_the_tree_as_it_stands(setup):
     for name, module in scripts_of(setup).items():
         assert os.access(Path(sysconfig.get_path('scripts')) / name, os.X_OK)
         (entry,) = {e.value for e in entry_points(group='console_scripts', name=name)}
-        assert entry == f'{module}:main'
+        assert entry == f'{NAME}.start:{module.rpartition(".")[2]}'
 
 
 def modules_of(folder):

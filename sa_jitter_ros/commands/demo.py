@@ -141,7 +141,7 @@ def node_command(name: str, parameters: Mapping[str, object], params: Path | Non
                  ) -> list[str]:
     """Return the command line of one of this package's nodes with parameters."""
     command = [sys.executable, '-c',
-               f'from sa_jitter_ros.nodes.{name} import main; raise SystemExit(main())',
+               f'from sa_jitter_ros.start import {name}; raise SystemExit({name}())',
                '--ros-args', '--log-level', 'warn',
                *(['--params-file', str(params)] if params else [])]
     for key, value in parameters.items():
