@@ -246,7 +246,7 @@ def test_status_says_who_receives_the_pulses(bench, ros_graph):
     assert bench().diagnostics()[2]['subscribers'] == '1'
     alone = ros_graph.add(TachDetector, {'tach_type': 'std_msgs/Float64MultiArray'},
                           namespace='/alone')
-    assert alone.summary()[1]['subscribers'] == '0'
+    assert alone.summary()[1]['subscribers'] == 0
 
 
 def test_silence_is_not_a_keyphasor(bench, rng):

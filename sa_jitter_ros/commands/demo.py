@@ -34,6 +34,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sa_jitter_ros.averaging.indicators import GearSettings
+from sa_jitter_ros.averaging.results import AverageMessage
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, FORMATS, Parser, player_options, read_options, run_to_end)
 from sa_jitter_ros.commands.demo_plan import (
@@ -42,8 +43,7 @@ from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
-from sa_jitter_ros.nodes.messages import (
-    AverageMessage, decode_average, decode_prediction, PredictionMessage)
+from sa_jitter_ros.nodes.messages import decode_average, decode_prediction, PredictionMessage
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.figures import write_figures
 from sa_jitter_ros.offline.files import ARRAYS, Signals, TABLE, write_averages

@@ -28,9 +28,8 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (DurabilityPolicy, HistoryPolicy, qos_check_compatible,
-                       qos_policy_name_from_kind, QoSCompatibility, QoSPolicyKind, QoSProfile,
-                       ReliabilityPolicy)
+from rclpy.qos import (DurabilityPolicy, qos_check_compatible, qos_policy_name_from_kind,
+                       QoSCompatibility, QoSPolicyKind, QoSProfile)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
@@ -53,11 +52,6 @@ _USAGE = ('usage: {} --ros-args [-p NAME:=VALUE] [--params-file FILE] [-r OLD:=N
 _UNKNOWN = ' are no arguments of ROS: give -p NAME:=VALUE, --params-file FILE or -r OLD:=NEW'
 
 
-def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, durability=durability,
-                      reliability=ReliabilityPolicy.RELIABLE)
-
-
 def _incompatibility(subscription: Subscription, policy: str) -> str:
     name = subscription.topic_name
     return (f'a publisher of {name} offers an incompatible {policy}: match it with the parameter '
@@ -70,10 +64,9 @@ _OVERRIDABLE = QoSOverridingOptions(policy_kinds=(
 # A subscriber logs by itself that its quality of service is incompatible. An executor would ask
 # every publisher for such events each time that it waits.
 _NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
-# Given to rclpy as copies: it writes the user's overrides into the profile that it gets.
-INPUT_QOS = _reliable(200, DurabilityPolicy.VOLATILE)
-RESULT_QOS = _reliable(10, DurabilityPolicy.VOLATILE)
-LATCHED_QOS = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+# Reliable, keep last. Given to rclpy as copies: it writes the user's overrides into the profile.
+INPUT_QOS, RESULT_QOS = QoSProfile(depth=200), QoSProfile(depth=10)
+LATCHED_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class MonitoringNode(Node):
@@ -272,7 +265,7 @@ class MonitoringNode(Node):
     def keep_state(self) -> None:
         """Write what has to outlast the node; it may go on afterwards."""
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return the node's state in one line, and values to publish beside the counts."""
         return 'running', {}
 
@@ -303,11 +296,10 @@ class MonitoringNode(Node):
             message=first_of(problems) or (f'{", ".join(grown)} increased' if grown else text),
             hardware_id=self.hardware_id)
         self._reported, self._last_warning = dict(self.counts), ''
-        shown = {**{key: str(count) for key, count in self.counts.items()},
-                 **self.health.ages(), **values}
+        shown = {**self.counts, **self.health.ages(), **values}
         if (everything := '; '.join(problems)) != first_of(problems):
             shown['problems'] = everything
-        status.values = [KeyValue(key=key, value=value) for key, value in shown.items()]
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in shown.items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)

@@ -22,7 +22,7 @@ from urllib.parse import quote
 
 from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
-from sa_jitter_ros.machine import LEVELS, Machine
+from sa_jitter_ros.machine import LEVELS
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.machine_monitor import MachineMonitor
 from sa_jitter_ros.monitoring.monitor import PARAMETERS as TEST_PARAMETERS, Settings
@@ -102,8 +102,7 @@ class ChangeMonitor(MonitoringNode):
         values = self._values
         self._monitor: MachineMonitor | None = None
         self._fail('baseline', '')
-        given = self.parameters.given_values
-        parts, channels = Machine.among(given), channels_of(given)
+        parts, channels = self.parameters.machine, channels_of(self.parameters.given_values)
         limits = LimitWatch(parts, values['shafts'], list(channels),
                             labels=lambda count: scale_of(channels, count).labels)
         try:
@@ -242,21 +241,21 @@ class ChangeMonitor(MonitoringNode):
                 f'without {lack}, {UNCORRECTED}, or allow_uncorrected: true if it will never be '
                 'exchanged') if lack else '')
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return what is learnt and how many quantities have changed."""
         monitor = self._monitor
         if monitor is None:
-            return 'nothing is monitored', {'baseline_file': str(self._path)}
+            return 'nothing is monitored', {'baseline_file': self._path}
         found = monitor.monitors
         changes = len(monitor.changes())
-        values = {
-            'baseline_averages': str(monitor.averages),
-            'baseline_complete': str(monitor.is_complete).lower(), 'changes': str(changes),
-            'limits_passed': str(len(monitor.limits.passed())),
-            'uncorrected': str(sum(item.uncorrected for item in found.values())),
-            'averages_discarded': str(monitor.discarded),
-            'averages_beyond_bins': str(sum(item.beyond for item in found.values())),
-            'baseline_file': str(self._path or f'{_NOT_KEPT}, lost when the node ends')}
+        values: dict[str, object] = {
+            'baseline_averages': monitor.averages,
+            'baseline_complete': str(monitor.is_complete).lower(), 'changes': changes,
+            'limits_passed': len(monitor.limits.passed()),
+            'uncorrected': sum(item.uncorrected for item in found.values()),
+            'averages_discarded': monitor.discarded,
+            'averages_beyond_bins': sum(item.beyond for item in found.values()),
+            'baseline_file': self._path or f'{_NOT_KEPT}, lost when the node ends'}
         refusals = [f'{shaft}: {reason}' for shaft, reason in monitor.refusals.items() if reason]
         if refusals:
             return f'{monitor.discarded} averages discarded; {first_of(refusals)}', values

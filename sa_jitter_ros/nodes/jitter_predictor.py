@@ -118,14 +118,14 @@ class JitterPredictor(MonitoringNode):
         """Return the speed of the tach shaft in the last prediction, Hz."""
         return next(iter(self._models.values())).trigger_speed
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return what is predicted, the number of predictions and the declared effects."""
         orders = sum(len(model.orders) for model in self._models.values())
         model = next(iter(self._models.values()))
         shafts = f' of {len(self._models)} shafts' if len(self._models) > 1 else ''
         return (f'{orders} orders{shafts} at {model.trigger_speed:.6g} Hz, keyphasor '
                 f'{model.keyphasor_rate:.6g} Hz, {model.trigger_cycles} trigger cycles',
-                {'predictions': str(self._published),
+                {'predictions': self._published,
                  'effects': ', '.join(effect.name for effect in self._declaration.effects)})
 
 

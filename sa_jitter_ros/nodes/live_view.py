@@ -18,6 +18,7 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from sa_jitter_ros.averaging.results import AverageMessage
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
@@ -27,8 +28,7 @@ from sa_jitter_ros.nodes.live_view_board import (
     spectrum_content, SPEEDS, table_content, Trend, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (
-    AverageMessage, decode_average, decode_prediction, decode_residual, PREDICTION_FIELDS,
-    RESIDUAL_FIELDS)
+    decode_average, decode_prediction, decode_residual, PREDICTION_FIELDS, RESIDUAL_FIELDS)
 from sa_jitter_ros.nodes.result_flows import AVERAGE, ResultFlows
 from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
@@ -226,7 +226,7 @@ class LiveView(MonitoringNode):
 
     # --- diagnostics ---
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return the address of the page and the number of averages on it."""
         assert self._server is not None
         silence = self._board.silence()
@@ -234,9 +234,8 @@ class LiveView(MonitoringNode):
             f'{self._averages} averages shown' if silence < 3.0 else
             f'no data for {silence:.0f} s')
         return f'{state}; page at {self._server.address}', {
-            'address': self._server.address, 'averages': str(self._averages),
-            'requests': str(self._server.requests),
-            'requests_refused': str(self._server.refused)}
+            'address': self._server.address, 'averages': self._averages,
+            'requests': self._server.requests, 'requests_refused': self._server.refused}
 
 
 def main(args: Sequence[str] | None = None) -> int:

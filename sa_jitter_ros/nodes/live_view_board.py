@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.arrays import Array, FloatArray
+from sa_jitter_ros.averaging.results import AverageMessage, PULSE_ERROR_FIELDS
 from sa_jitter_ros.json_values import json_values
-from sa_jitter_ros.nodes.messages import (
-    AverageMessage, PredictionMessage, PULSE_ERROR_FIELDS, ResidualMessage)
+from sa_jitter_ros.nodes.messages import PredictionMessage, ResidualMessage
 
 Json = Any
 

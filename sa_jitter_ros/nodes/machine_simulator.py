@@ -17,6 +17,7 @@ import math
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.declaration import MODEL_PARAMETERS
 from sa_jitter_ros.effects import enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ParameterError
@@ -32,6 +33,7 @@ from sa_jitter_ros.simulation import (
 from sa_jitter_ros.simulation.effects import JITTER_DISTRIBUTIONS
 from sa_jitter_ros.simulation.random_streams import ZERO
 
+_DECLARED = {item.name: item for item in MODEL_PARAMETERS}
 PARAMETERS = (
     fixed('seed', 0, 'seed of all random numbers', minimum=0),
     fixed('start_time', 0.0, 'time of the first sample', unit='s'),
@@ -54,15 +56,12 @@ PARAMETERS = (
           choices=('pulses', 'waveform', 'both', 'none')),
     replace(PULSES_PER_REVOLUTION, read_only=True),
     replace(PULSES_PER_TRIGGER, read_only=True),
-    Parameter('keyphasor_rate', 10000.0, 'sampling rate of the keyphasor', unit='Hz', above=0.0),
+    _DECLARED['keyphasor_rate'],
     Parameter('jitter_distribution', 'uniform', 'distribution of the declared pulse error; '
               'sampled: times rounded up to ticks of keyphasor_rate',
               choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
-    Parameter('jitter_std', 0.0, 'standard deviation of a normal or triangular pulse error; '
-              '0: 1/(sqrt(12) keyphasor_rate)',
-              unit='s', minimum=0.0),
-    Parameter('jitter_table', [], 'equally likely pulse errors, for jitter_distribution table',
-              unit='s'),
+    _DECLARED['jitter_std'],
+    _DECLARED['jitter_table'],
     fixed('waveform', 'ttl', 'shape of the tach waveform', choices=('ttl', 'sine')),
     fixed('waveform_rate', 50000.0, 'sampling rate of the tach waveform', unit='Hz', above=0.0),
     fixed('waveform_rise_time', 0.0, 'rise time of a ttl edge', unit='s', minimum=0.0),
@@ -140,7 +139,7 @@ def machine_of(values: Values) -> Gearbox:
         keyphasor=Keyphasor(
             pulses_per_revolution=values['pulses_per_revolution'],
             pulses_per_trigger=values['pulses_per_trigger'] or None,
-            rate=values['waveform_rate'], waveform=values['waveform'], high=5.0,
+            rate=values['waveform_rate'], waveform=values['waveform'],
             rise_time=values['waveform_rise_time'], noise_std=values['waveform_noise_std']),
         faults=faults, effects=simulated_effects(values), seed=seed)
 

@@ -27,7 +27,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
-from sa_jitter_ros.averaging import results
+from sa_jitter_ros.averaging.results import (
+    AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS, PULSE_ERROR_FIELDS,
+    SPECTRUM_FIELDS)
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings import message_layouts
@@ -39,16 +41,11 @@ from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimensi
 
 ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 
-AMPLITUDE_FIELDS = results.AMPLITUDE_FIELDS
-ENVELOPE_FIELDS, SPECTRUM_FIELDS = results.ENVELOPE_FIELDS, results.SPECTRUM_FIELDS
-PULSE_ERROR_FIELDS = results.PULSE_ERROR_FIELDS
 GEOMETRY_FIELDS = ('angle', 'standard_error')
 PREDICTION_FIELDS = (
     'order', 'mean_attenuation', 'variance', 'standard_deviation',
     'quantile_05', 'quantile_50', 'quantile_95')
 RESIDUAL_FIELDS = ('order', 'observed', 'predicted', 'residual', 'standard_error', 'z')
-AverageHeader = results.AverageHeader
-AverageMessage = results.AverageMessage
 SAMPLE_TYPES: dict[str, type] = {
     FLOAT64: Float64MultiArray,
     FLOAT32: Float32MultiArray,

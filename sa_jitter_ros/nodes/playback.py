@@ -230,9 +230,9 @@ class PlaybackNode(MonitoringNode):
             self._progress_time = time.monotonic()
             self.get_logger().info(self.progress(self._sent))
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return state and progress, and how much was sent."""
         state = ('ended' if self._stream is None else 'paused' if not self._playing
                  else 'playing' if self._started else 'waiting for subscribers')
         return f'{state}, {self.progress(self._sent)}', {
-            'seconds_sent': f'{self._sent:.3f}', 'pulses_sent': str(self._pulses_sent())}
+            'seconds_sent': f'{self._sent:.3f}', 'pulses_sent': self._pulses_sent()}

@@ -25,6 +25,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
+from sa_jitter_ros.averaging.results import AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.declaration import declaration_of, predictor_parameters, SHAFTS
 from sa_jitter_ros.effects import Effect
@@ -34,8 +35,8 @@ from sa_jitter_ros.inference.online import (
 from sa_jitter_ros.inference.online_trace import trace_averages
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
-from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
-                                          encode_residual, ResidualMessage)
+from sa_jitter_ros.nodes.messages import (
+    decode_average, decode_prediction, encode_residual, ResidualMessage)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name
 from sa_jitter_ros.nodes.result_flows import ResultFlows, UNCORRECTED
 from sa_jitter_ros.parameters import fixed, Parameter, require_shaft_names, Values
@@ -263,8 +264,9 @@ class ResidualAnalyser(MonitoringNode):
         self._missing_effect.publish(String(data=json.dumps(content, allow_nan=False)))
         found = {item.name: item.effect.values for item in (*trace.findings, *trace.refinements)
                  if item.effect is not None}
-        changed = (found or self._added) if self._significant else (found and not self._added)
-        if self._values['close_loop'] and changed:
+        # Effects that are set stay as they are until a residual is significant with them.
+        due = self._significant if self._added else bool(found)
+        if self._values['close_loop'] and due:
             yield from self._set_effects(found)
 
     def _set_effects(self, found: Mapping[str, Mapping[str, Any]]) -> Waiting[None]:
@@ -279,10 +281,12 @@ class ResidualAnalyser(MonitoringNode):
         response = yield from self._answer(partial(
             self._predictor.set_parameters_atomically,
             [as_ros_parameter(name, value) for name, value in wanted.items()]))
-        refused = (
-            'does not answer: its effects cannot be set; start the node, or set the parameter '
-            'predictor to its name' if response is None else '' if response.result.successful else
-            f'refuses the effects: {response.result.reason}')
+        refused = ''
+        if response is None:
+            refused = ('does not answer: its effects cannot be set; start the node, or set the '
+                       'parameter predictor to its name')
+        elif not response.result.successful:
+            refused = f'refuses the effects: {response.result.reason}'
         self.set_missing('closed loop', refused and f'{self._predictor_name} {refused}')
         if not refused:
             self._added = set(found)
@@ -317,15 +321,14 @@ class ResidualAnalyser(MonitoringNode):
             except SaJitterError as error:
                 self.set_missing('residual', str(error))
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return the number of averages in the batch and the last verdict."""
-        count, size = len(self._batch.averages), self._batch.size
-        values = {'shaft': self._values['shaft'], 'averages': str(count),
-                  'batches': str(self._batches), 'verdict': self._verdict,
-                  'uncorrected': str(self._uncorrected),
-                  'averages_with_discarded_cycles': str(self._interrupted),
-                  'averages_with_unresolved_pulses': str(self._unresolved),
-                  'averages_not_traced': str(self._untraced),
+        count = len(self._batch.averages)
+        values = {'shaft': self._values['shaft'], 'averages': count, 'batches': self._batches,
+                  'verdict': self._verdict, 'uncorrected': self._uncorrected,
+                  'averages_with_discarded_cycles': self._interrupted,
+                  'averages_with_unresolved_pulses': self._unresolved,
+                  'averages_not_traced': self._untraced,
                   'effects_set': ', '.join(sorted(self._added))}
         if self._prediction is None:
             return 'no prediction received yet', values
@@ -333,9 +336,9 @@ class ResidualAnalyser(MonitoringNode):
             topic = self.resolve_topic_name(f"{self._values['shaft']}/order_amplitude")
             return (f'nothing received on {topic} yet: is the parameter shaft one of the '
                     'averager?', values)
-        verdict = f'last verdict: {self._verdict}' if self._verdict else 'nothing compared yet'
-        activity = self._activity or verdict
-        return f'{count} of {size} averages; {activity}', values
+        activity = self._activity or (
+            f'last verdict: {self._verdict}' if self._verdict else 'nothing compared yet')
+        return f'{count} of {self._batch.size} averages; {activity}', values
 
 
 def _in_thread(work: Callable[[], Trace]) -> 'futures.Future[Trace]':

@@ -152,13 +152,13 @@ class JointInput:
         self._time = time
         return pulses
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return what the node says of its state, and the values behind it."""
         state = self.crossings.state
-        values = {name: f'{getattr(state, name):.6g}' for name in (
+        values: dict[str, object] = {name: f'{getattr(state, name):.6g}' for name in (
             'pulse_error_std', 'angle_resolution', 'stamp_noise_std')}
-        values |= {name: str(getattr(state, name)) for name in ('reversals', 'stops', 'glitches')}
-        values |= {'joint': self.joint, 'messages_of_others': str(self.others)}
+        values |= {name: getattr(state, name) for name in ('reversals', 'stops', 'glitches')}
+        values |= {'joint': self.joint, 'messages_of_others': self.others}
         if not state.samples:
             of = f' of joint {self.joint}' if self.joint else ''
             return f'no position{of} received yet', values

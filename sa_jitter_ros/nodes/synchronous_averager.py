@@ -25,7 +25,6 @@ from sa_jitter_ros.averaging.averager_parameters import (
 from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
 from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -54,16 +53,15 @@ class SynchronousAverager(MonitoringNode):
         for name in names:
             self.parameters.declare(shaft_parameters(name))
         values = self.parameters.values()
-        for name in names:
-            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given_values:
-                raise one_ratio(values, name)
         given = self.parameters.given_values
-        limits = LimitWatch(Machine.among(given), names, list(channels_of(given)),
+        for name in names:
+            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in given:
+                raise one_ratio(values, name)
+        limits = LimitWatch(self.parameters.machine, names, list(channels_of(given)),
                             labels=lambda count: self._samples.scale_of(count).labels)
         self._shafts = {name: ShaftOutput(self, name, limits) for name in names}
         self._latest = {name: deque[Average](maxlen=_LATEST) for name in names}
         self._averager = streaming_averager(values, buffer_seconds=values['buffer_seconds'])
-        self._check(values)
         for name, shaft in self._shafts.items():
             shaft.use(gear_settings(values, name))
         self._values = values
@@ -188,25 +186,24 @@ class SynchronousAverager(MonitoringNode):
         if self._tach.msg_type is TimeReference:  # each keyphasor may have a publisher
             self.most_publishers[self._tach.topic_name] = len(self._sources)
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return the number of averages and the counts of the pulse validation."""
         averager = self._averager
         layout = averager.timeline.layout
         published = sum(shaft.published for shaft in self._shafts.values())
-        values = {'trigger_cycles': str(averager.counts.cycles), 'averages': str(published),
-                  'keyphasor': self._keyphasor or '',
-                  'pulses_of_others': str(self._other_keyphasors),
-                  **{f'pulses_{key}': str(count)
+        values = {'trigger_cycles': averager.counts.cycles, 'averages': published,
+                  'keyphasor': self._keyphasor or '', 'pulses_of_others': self._other_keyphasors,
+                  **{f'pulses_{key}': count
                      for key, count in asdict(averager.pulse_counts).items()}}
         if averager.geometry is not None:
-            values['target_geometry'] = str(averager.geometry)
-        refused = {name: shaft.refused for name, shaft in self._shafts.items() if shaft.refused}
-        for name, count in refused.items():
-            values[f'{name}.corrections_refused'] = str(count)
-            values[f'{name}.refusal'] = self._shafts[name].refusal
+            values['target_geometry'] = averager.geometry
+        for name, shaft in self._shafts.items():
+            if shaft.refused:
+                values |= {f'{name}.corrections_refused': shaft.refused,
+                           f'{name}.refusal': shaft.refusal}
         if layout is None:
             return 'no vibration received yet', values
-        values.update(channels=str(layout[0]), sample_rate=f'{layout[1]:.10g}')
+        values.update(channels=layout[0], sample_rate=f'{layout[1]:.10g}')
         if not averager.counts.cycles:
             return 'no trigger cycle completed yet', values
         return f'{published} averages of {averager.counts.cycles} trigger cycles', values

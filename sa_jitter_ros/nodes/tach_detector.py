@@ -42,7 +42,7 @@ PARAMETERS = (
     TACH_TYPE,
     fixed('tach_waveform_type', '', 'message type of tach_waveform; empty: that of '
           f'vibration_type; {JOINT_TYPE}: its positions (rad) give the pulses'),
-    fixed('joint', '', f'joint of {JOINT_TYPE} to follow; ' 'empty: the only one'),
+    fixed('joint', '', f'joint of {JOINT_TYPE} to follow; empty: the only one'),
     replace(PULSES_PER_REVOLUTION, read_only=True, description='marks on a revolution of the '
             'joint, one at angle 0'),
     fixed('imu_axis', 'z', 'axis of linear acceleration', choices=('x', 'y', 'z')),
@@ -176,9 +176,10 @@ class TachDetector(MonitoringNode):
             self.counts.update(samples_dropped=joint.dropped, gaps=joint.gaps,
                                restarts=joint.restarts)
 
-    def summary(self) -> tuple[str, dict[str, str]]:
+    def summary(self) -> tuple[str, dict[str, object]]:
         """Return the numbers of pulses found and of subscribers, the levels, the threshold."""
-        values = {'pulses': str(self._pulses), 'subscribers': str(self._output.subscribers)}
+        values: dict[str, object] = {
+            'pulses': self._pulses, 'subscribers': self._output.subscribers}
         if self._joint:
             text, others = self._joint.summary()
             return text, {**others, **values}
