@@ -42,6 +42,6 @@ def json_values(value: Any) -> Any:
     return value
 
 
-def json_text(value: Any, indent: int = 1) -> str:
+def json_text(value: Any) -> str:
     """Return results as the text of a file in JSON."""
-    return json.dumps(json_values(value), indent=indent, allow_nan=False) + '\n'
+    return json.dumps(json_values(value), indent=1, allow_nan=False) + '\n'

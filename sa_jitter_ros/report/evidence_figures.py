@@ -17,12 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import LINEAR
-from sa_jitter_ros.report.expected_errors import (
-    cycle_places, lags_of, Version, versions_of, with_explained_errors)
+from sa_jitter_ros.report.expected_errors import cycle_places, lags_of, Version
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, MEASURED, panels
 
 Words = Callable[[float], str]  # an order in a sentence
@@ -33,9 +31,8 @@ _STEPS = 16  # positions in a trigger cycle
 _FINEST = 1e-6  # half the range of a histogram of relative intervals that are all equal
 
 
-def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+def pulse_errors(evidence: Evidence, versions: Sequence[Version]) -> Figure:
     """Draw the pulse errors over time, their distribution, autocorrelation, clock and origin."""
-    evidence, versions = with_explained_errors(evidence), versions_of(evidence, effects)
     figure, axes = panels(8)
     _over_time(axes[0], evidence, versions[-1])
     _distribution(axes[1], evidence, versions)
@@ -48,13 +45,12 @@ def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     return figure
 
 
-def trigger_cycle(evidence: Evidence, effects: Sequence[Effect], *, words: Words) -> Figure:
+def trigger_cycle(evidence: Evidence, versions: Sequence[Version], *, words: Words) -> Figure:
     """
     Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index.
 
     `words` names an order.
     """
-    evidence, versions = with_explained_errors(evidence), versions_of(evidence, effects)
     figure, axes = panels(3)
     _profile(axes[0], evidence, versions)
     _dependence_on_cycles(axes[1], evidence, versions, words)

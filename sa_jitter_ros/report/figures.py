@@ -27,6 +27,7 @@ from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.number_text import HALF_95, order_text
 from sa_jitter_ros.report import evidence_figures
+from sa_jitter_ros.report.expected_errors import versions_of, with_explained_errors
 from sa_jitter_ros.report.plotting import AFTER, arrange, BEFORE, MEASURED, panels, with_effects
 
 _FEWEST_CYCLES = 3
@@ -77,7 +78,9 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
             _distribution_figure(trace))]
     if trace.evidence is None or trace.observation.model.trigger_cycles < _FEWEST_CYCLES:
         return tuple(found)
-    effects, words = tuple(effects_of(trace.findings)), trace.observation.words
+    words = trace.observation.words
+    evidence = with_explained_errors(trace.evidence)
+    versions = versions_of(trace.evidence, tuple(effects_of(trace.findings)))
     drawn: Sequence[tuple[str, str, str, Callable[..., Figure]]] = (
         ('pulse_errors', 'Pulse errors',
          'Recovered pulse errors (measured minus true time) of the fitted acquisitions, and those '
@@ -93,7 +96,7 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
          lambda evidence, _: evidence_figures.amplitudes(
              evidence, trace.observation.channel_names, words)))
     for name, title, caption, draw in drawn:
-        found.append(Illustration(name, title, caption, draw(trace.evidence, effects)))
+        found.append(Illustration(name, title, caption, draw(evidence, versions)))
     return tuple(found)
 
 

@@ -12,12 +12,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
+import json
 from pathlib import PurePath
 from typing import Any
 
 from sa_jitter_ros.html_parts import figure, kept, page, part, table
 from sa_jitter_ros.inference.trace_result import Trace
-from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.number_text import measured_text, order_text, percent_text
 from sa_jitter_ros.report.figures import illustrate, Illustration
 from sa_jitter_ros.report.report import ONLY_SHAFT, parameter_unit
@@ -44,8 +44,12 @@ def report_files(trace: Trace, content: Mapping[str, Json]) -> Mapping[str, byte
     """Return all files of a report by name; `content` is that of `report.json`."""
     figures = illustrate(trace)
     pictures = {f'{item.name}.png': item.png() for item in figures}
-    return {'report.json': json_text(content, 2).encode(),
+    return {'report.json': _text(content),
             'report.html': html(content, figures, pictures).encode(), **pictures}
+
+
+def _text(content: Mapping[str, Json]) -> bytes:
+    return f'{json.dumps(content, indent=2, allow_nan=False)}\n'.encode()
 
 
 def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, bytes]]
@@ -60,7 +64,7 @@ def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, b
     for shaft, item in shafts.items():
         parts += [f'<h2><a href="{escape(shaft)}/report.html">Shaft {escape(shaft)}</a></h2>',
                   _verdict(item)]
-    return {'report.json': json_text(content, 2).encode(),
+    return {'report.json': _text(content),
             'report.html': page(f'Report: {content["verdict"]}', parts).encode(),
             **{f'{shaft}/{name}': data for shaft, each in files.items()
                for name, data in each.items()}}
