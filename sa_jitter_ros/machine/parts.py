@@ -342,6 +342,11 @@ class Limit(Part):
                                  'baseline, more than 1')
 
     @property
+    def what(self) -> str:
+        """Return in words what the limit is for."""
+        return self.indicator or self.part or f'order {self.order:g}'
+
+    @property
     def bounds(self) -> dict[str, float]:
         """Return the bounds that are given, by level."""
         return {level: value for level, value in zip(LEVELS, (self.warn, self.alarm))

@@ -178,13 +178,13 @@ class LimitWatch:
                 names = [label[-1] for label in self._labels(average.layout.channels)]
                 self.missing[name] = f'no channel {item.limit.channel} among {", ".join(names)}'
             elif quantity is None:
-                self.missing[name] = (f'the averages of {shaft} lack {_asked(item.limit)}: see '
+                self.missing[name] = (f'the averages of {shaft} lack {item.limit.what}: see '
                                       f'{shaft}.{_PARAMETERS[item.kinds[0]]}')
             else:
                 values, noise = average.readings[:2, channels, quantity]
                 if np.isfinite(values).any() and not np.isfinite(values + noise).any():
-                    self.missing[name] = (f'{_asked(item.limit)} of {shaft} has no standard error:'
-                                          ' take more trigger cycles')
+                    self.missing[name] = (f'{item.limit.what} of {shaft} has no standard error: '
+                                          'take more trigger cycles')
                 for channel in channels:
                     lines += self._judge(name, channel, quantity, average,
                                          float(usual[channel, quantity]))
@@ -257,8 +257,3 @@ def _shaft_of(place: str, limit: Limit, machine: Machine, shafts: Sequence[str])
         raise ParameterError(f'{place} is of which shaft? give shaft, one of '
                              f'{", ".join(monitored)}')
     return limit.shaft or monitored[0]
-
-
-def _asked(limit: Limit) -> str:
-    """Return in words what a limit is for."""
-    return limit.indicator or limit.part or f'order {limit.order:g}'

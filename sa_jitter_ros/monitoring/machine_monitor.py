@@ -173,13 +173,12 @@ class MachineMonitor:
                 return []
         self.uncorrected[shaft].add(not average.is_corrected)
         monitor = self.monitors.get(shaft) or self._begin(shaft, average)
-        fitted = average.fitted(monitor.layout) if monitor is not None else None
-        lines = self.limits.update(shaft, average) if monitor is None or fitted is None else (
-            self.limits.update(shaft, fitted, monitor.usual()))
         if monitor is None:
-            return lines
+            return self.limits.update(shaft, average)
         self.unsaved = True
-        return lines + monitor.update(average)
+        fitted = average.fitted(monitor.layout)
+        usual = monitor.usual() if fitted else None
+        return self.limits.update(shaft, fitted or average, usual) + monitor.update(average)
 
     def _begin(self, shaft: str, average: MonitoredAverage) -> ShaftMonitor | None:
         """Return a new monitor, or None while it is not known what the shaft has."""

@@ -127,17 +127,15 @@ class MonitoredAverage:
         if (own.channels, own.orders) != (layout.channels, layout.orders) or (
                 not {*own.bearings} <= {*layout.bearings}):
             return None
-        places = {quantity: place for place, quantity in enumerate(own.quantities)}
-        found = []
-        for array in (self.values, self.noise, self.doubt, self.readings):
-            rows = np.full((*array.shape[:-2], *layout.shape), np.nan)
-            for place, quantity in enumerate(layout.quantities):
-                if quantity in places:
-                    rows[..., place] = array[..., places[quantity]]
-            found.append(rows)
-        values, noise, doubt, readings = found
-        return replace(self, layout=layout, values=values, noise=noise, doubt=doubt,
-                       readings=readings)
+        known = {quantity: place for place, quantity in enumerate(own.quantities)}
+        places = np.array([known.get(item, len(known)) for item in layout.quantities], np.int64)
+
+        def placed(array: FloatArray) -> FloatArray:
+            none = np.full((*array.shape[:-1], 1), np.nan)
+            return np.concatenate((array, none), axis=-1)[..., places]
+
+        return replace(self, layout=layout, values=placed(self.values), noise=placed(self.noise),
+                       doubt=placed(self.doubt), readings=placed(self.readings))
 
 
 def monitored(arrays: Mapping[str, AverageMessage], *, allow_uncorrected: bool = False,

@@ -98,8 +98,7 @@ def _limits(signals: Signals) -> Iterator[str]:
     if signals.machine.limits:
         yield '<h2>Limits</h2>'
         yield table(('limit', 'of', 'shaft', 'channel', *LEVELS), [
-            (name, limit.part or limit.indicator or order_words(limit.order),
-             limit.shaft or '', limit.channel or 'all', *(
+            (name, limit.what, limit.shaft or '', limit.channel or 'all', *(
                  f'{limit.bounds[level]:g}{" × baseline" * bool(limit.relative)}'
                  if level in limit.bounds else '–' for level in LEVELS))
             for name, limit in signals.machine.limits.items()], kind='pairs')
