@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands import (
     average, check_keyphasor, close_loop, layouts, loop_run, progress)
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.parameter_file import shipped
 
 
@@ -99,15 +99,20 @@ def test_command_runs_in_any_thread_and_gives_sigterm_back(tmp_path, capsys):
 def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypatch):
     np.savez(tmp_path / 'rig.npz', vibration=np.zeros(100), sample_rate=1e3,
              pulse_times=[0.0, 0.05])
-    monkeypatch.setattr(check_keyphasor, 'check_keyphasor', lambda recording, **_: recording)
+    checked = []
+
+    def refused(recording, **_):
+        checked.append(recording)
+        raise SignalError('seen')
+
+    monkeypatch.setattr(check_keyphasor, 'check_keyphasor', refused)
     command = [str(tmp_path / 'rig.npz'), '--output', str(tmp_path), '--params',
                str(shipped('machine.yaml'))]
-    parser = check_keyphasor.make_parser()
-    quiet = progress.Progress('check_keyphasor', quiet=True)
-    found, _ = check_keyphasor.run(parser.parse_args(command), quiet)
+    assert check_keyphasor.main(command) == check_keyphasor.main([
+        *command, '--field', 'ratio=3']) == 2
+    found, given = checked
     assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (183 / 76, 19.0, 1)
-    found, _ = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']), quiet)
-    assert (found.ratio, found.orders[0]) == (3.0, 19.0)
+    assert (given.ratio, given.orders[0]) == (3.0, 19.0)
 
 
 class Terminal(io.StringIO):

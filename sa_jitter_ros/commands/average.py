@@ -85,17 +85,6 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     return settings
 
 
-def planned(options: argparse.Namespace) -> list[AverageJob]:
-    """Return the jobs; raises ParameterError."""
-    machine = MachineFile.read(options.params, options.given)
-    if machine.unknown:
-        print(f'average: {options.params}: ignored, because synchronous_averager has no such '
-              f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
-    return jobs_of(options, partial(
-        AverageJob, machine=machine, options=read_options(options),
-        figures=not options.no_figures, state=options.state, tacholess=tacholess_options(options)))
-
-
 def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Changes | None]:
     """
     Average the recordings and write the tables; raises SaJitterError, OSError.
@@ -103,7 +92,14 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     Return what became of them and, with a baseline, what has changed.
     """
     settings = settings_for_changes(options)
-    jobs, rows = planned(options), list[Row]()
+    machine = MachineFile.read(options.params, options.given)
+    if machine.unknown:
+        progress.say(f'{options.params}: ignored, because synchronous_averager has no such '
+                     f'parameters: {", ".join(machine.unknown)}')
+    jobs, rows = jobs_of(options, partial(
+        AverageJob, machine=machine, options=read_options(options),
+        figures=not options.no_figures, state=options.state,
+        tacholess=tacholess_options(options))), list[Row]()
 
     def alone(job: AverageJob) -> Row:
         done = len(rows)
@@ -123,8 +119,7 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     averaged = {row.recording for row in rows if row.averages}
     found = find_changes(
         options.output, [job.name for job in jobs if job.name in averaged and not job.error],
-        settings,
-        jobs[0].machine.machine, state=options.state)
+        settings, machine.machine, state=options.state)
     found.write(options.output)
     if not options.no_figures:
         from sa_jitter_ros.offline.change_figure import write_figure

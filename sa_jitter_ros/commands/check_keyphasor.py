@@ -17,7 +17,7 @@ of the vibration. It says what each finding costs, and writes a parameter file f
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 import sys
 from typing import Any
@@ -36,7 +36,6 @@ from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read
-from sa_jitter_ros.recordings.recording import Recording
 
 
 def make_parser() -> Parser:
@@ -70,37 +69,25 @@ def _machine_fields(params: Path | None) -> dict[str, Any]:
                      if model.pulses_per_trigger else {})
 
 
-def _declared(params: Path | None) -> Mapping[str, Any]:
-    """Return the parameters of a machine file, none without it; raises ParameterError."""
-    return {} if params is None else read_parameters(params, NODE)
-
-
-def run(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorCheck, Recording]:
-    """Check the recording, and return both; raises SaJitterError."""
+def run(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorCheck, list[str]]:
+    """Check the recording and write all files; return their names, too; raises SaJitterError."""
+    declared = {} if options.params is None else read_parameters(options.params, NODE)
     recording = read(options.recording, pulses_suffice=True,
                      **{**_machine_fields(options.params), **read_options(options)})
-    machine = Machine.among(_declared(options.params))
+    machine, output = Machine.among(declared), options.output
     if tacholess := tacholess_options(options):
         recording, _ = tacholess.pulses_of(recording, machine)
     for remark in recording.remarks:
         progress.step(remark)
-    return check_keyphasor(recording, teeth=options.teeth, machine=machine,
-                           progress=progress.step), recording
-
-
-def write(options: argparse.Namespace, progress: Progress) -> tuple[KeyphasorCheck, list[str]]:
-    """Check the recording and write all files; return their names, too."""
-    found, recording = run(options, progress)
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / 'keyphasor.json').write_text(json_text(found.report), encoding='utf-8')
-    (options.output / 'machine.yaml').write_text(
-        machine_file(found, options.recording.name, _declared(options.params)),
-        encoding='utf-8')
-    check_figure(found, options.recording.name).savefig(
-        options.output / 'keyphasor.png', dpi=110)
-    fitted = found.fitted
+    found = check_keyphasor(recording, teeth=options.teeth, machine=machine,
+                            progress=progress.step)
+    name, fitted = options.recording.name, found.fitted
+    output.mkdir(parents=True, exist_ok=True)
+    (output / 'keyphasor.json').write_text(json_text(found.report), encoding='utf-8')
+    (output / 'machine.yaml').write_text(machine_file(found, name, declared), encoding='utf-8')
+    check_figure(found, name).savefig(output / 'keyphasor.png', dpi=110)
     repaired = write_repairs(
-        options.output, options.recording.name, recording,
+        output, name, recording,
         np.union1d(fitted.true, fitted.strays),
         [*((time, 'early') for time in fitted.strays.tolist()),
          *((time, 'missing') for time in fitted.lost.tolist())])
@@ -117,7 +104,7 @@ def tell(options: argparse.Namespace, written: tuple[KeyphasorCheck, list[str]])
 def main(args: Sequence[str] | None = None) -> int:
     """Check a keyphasor; return 0, or 2 after one line on unusable input or output."""
     options = make_parser().parse_args(args)
-    return run_to_end(write, tell, options, Progress('check_keyphasor', quiet=options.quiet))
+    return run_to_end(run, tell, options, Progress('check_keyphasor', quiet=options.quiet))
 
 
 if __name__ == '__main__':

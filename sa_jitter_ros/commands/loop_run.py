@@ -14,7 +14,6 @@ import argparse
 from collections import Counter
 from functools import partial
 import os
-import sys
 
 from sa_jitter_ros.commands.command_line import (
     plain_warnings, read_options, run_to_end, show, tacholess_options)
@@ -62,8 +61,8 @@ def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
     """Close the loop on each recording, and write their table; raises SaJitterError, OSError."""
     declaration = read_declaration(options.declared, sample_rate=1e9)
     if declaration.unknown:
-        print(f'close_loop: {options.declared}: ignored, because jitter_predictor has no such '
-              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
+        progress.say(f'{options.declared}: ignored, because jitter_predictor has no such '
+                     f'parameters: {", ".join(declaration.unknown)}')
     jobs, rows = jobs_of(options, partial(
         LoopJob, declared=os.path.abspath(options.declared), options=read_options(options),
         tacholess=tacholess_options(options))), list[LoopRow]()

@@ -21,7 +21,7 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
 from sa_jitter_ros.averaging.results import AverageMessage, ShaftResults
 from sa_jitter_ros.averaging.uneven_revolution import lost_inside_revolutions
-from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
+from sa_jitter_ros.errors import RecordingError, SignalError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.quantities import monitored
@@ -29,9 +29,10 @@ from sa_jitter_ros.offline.files import (
     ARRAYS, join_tables, read_about, RecordingJob, RecordingRow, row_values, Signals, TABLE,
     write_averages, write_rows)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
-from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
+from sa_jitter_ros.offline.settings import averager_values, MachineFile
 from sa_jitter_ros.parameters import Values
 from sa_jitter_ros.pulses.detection import detector_of, spikes_text
+from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import (
@@ -88,14 +89,15 @@ class Row(RecordingRow):
 class RecordingAverager:
     """Averages a recording; the counts and remarks are complete when `results` is exhausted."""
 
-    def __init__(self, recording: Recording, values: Values, detector: Values,
-                 limits: LimitWatch, found: FoundPulses | None = None) -> None:
+    def __init__(self, recording: Recording, values: Values, detector: Mapping[str, Any],
+                 limits: LimitWatch, found: FoundPulses | None) -> None:
         self._recording, self._values, self._found = recording, values, found
         #: The averager, for its counts, and the times (s) of all pulses of the keyphasor.
         self.stream = streaming_averager(values, buffer_seconds=math.inf)
         self._results = {name: ShaftResults(gear_settings(values, name))
                          for name in values['shafts']}
-        waveform = detector_of(detector)
+        waveform = detector_of({
+            **{item.name: item.default for item in DETECTOR_PARAMETERS}, **detector})
         self.pulses = recording.keyphasor_pulses(detector=waveform)
         self._spikes = spikes_text(waveform.state.spikes)
         self.limits = limits
@@ -203,20 +205,17 @@ def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
     """
     Average one recording into its folder, unless that was done before with the same settings.
 
-    A recording that cannot be used gives a row with the reason. Raises OSError where the folder
-    cannot be written.
+    Raises SaJitterError for a recording that cannot be used, OSError where the folder cannot be
+    written.
     """
-    try:
-        machine = job.machine
-        settings = job.settings(
-            version=_VERSION, figures=job.figures, state=job.state, averager=machine.averager,
-            detector=machine.detector, machine=machine.parts, hardware_id=machine.hardware_id)
-        done = read_about(Path(job.folder))
-        if done is not None and done.get('settings') == settings:
-            return Row(**row_values(done['row']))
-        return _averaged(job, settings, progress)
-    except SaJitterError as error:
-        return Row(job.name, job.path, error=str(error))
+    machine = job.machine
+    settings = job.settings(
+        version=_VERSION, figures=job.figures, state=job.state, averager=machine.averager,
+        detector=machine.detector, machine=machine.parts, hardware_id=machine.hardware_id)
+    done = read_about(Path(job.folder))
+    if done.get('settings') == settings:
+        return Row(**row_values(done['row']))
+    return _averaged(job, settings, progress)
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:
@@ -243,7 +242,7 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
     limits = LimitWatch(job.machine.machine, values['shafts'], labels=lambda count: labels)
     signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
                       job.machine.machine, limits)
-    averager = RecordingAverager(recording, values, detector_values(job.machine), limits, found)
+    averager = RecordingAverager(recording, values, job.machine.detector, limits, found)
     with finished_together(Path(job.folder), last=ARRAYS) as folder:
         series = collect(averager, folder.parent, progress)
         if not series:

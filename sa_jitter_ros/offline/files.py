@@ -33,14 +33,12 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
-from sa_jitter_ros.offline.series import ShaftSeries
+from sa_jitter_ros.offline.series import HEADER, ShaftSeries
 from sa_jitter_ros.tacholess.recording import Tacholess
 from sa_jitter_ros.whole_files import TEMPORARY, whole_file
 
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
 
-_HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycles',
-           'fundamental_cycles', 'discarded_cycles')
 _OVER_ANGLE = ('_waveform', '_average', '_standard_error', '_spectrum')  # ends of names
 _COLUMNS = ('recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
             'trigger_cycles', 'discarded_cycles', 'channel')
@@ -132,20 +130,19 @@ def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries]
         'channel_names': np.array(signals.channel_names), 'units': np.array(signals.units),
         'shafts': np.array([item.shaft for item in series]),
         'about': np.array(json.dumps(json_values(about), allow_nan=False))}
-    arrays |= {name: series[0][name] for name in _HEADER}
+    arrays |= {name: series[0][name] for name in HEADER}
     for item in series:
         arrays |= {f'{item.shaft}_{name}': array for name, array in item.arrays.items()}
     np.savez(folder / ARRAYS, **arrays)
 
 
-def read_about(folder: Path) -> dict[str, Any] | None:
-    """Return what a finished folder says of itself, None if it is not finished."""
+def read_about(folder: Path) -> dict[str, Any]:
+    """Return what a finished folder says of itself, nothing if it is not finished."""
     try:
         with np.load(folder / ARRAYS) as arrays:
-            found = json.loads(str(arrays['about']))
+            return dict(json.loads(str(arrays['about'])))
     except Exception:  # a broken file may raise an exception of any type: it is written again
-        return None
-    return found if isinstance(found, dict) else None
+        return {}
 
 
 def read_averages(folder: Path) -> tuple[Signals, list[ShaftSeries], dict[str, Any]]:
@@ -182,7 +179,7 @@ def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) 
     for item in series:
         parts = [[signals.machine.name_of(item.shaft, order)] * len(named)
                  for order in item.orders.tolist()]
-        header = {name: item[name].tolist() for name in _HEADER}
+        header = {name: item[name].tolist() for name in HEADER}
         for row, (table, notes) in enumerate(zip(item['order_amplitude'], item['note'].tolist())):
             start = [signals.recording, item.shaft, *(
                 header[name][row] for name in _COLUMNS[2:-1])]

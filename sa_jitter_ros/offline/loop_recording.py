@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 import warnings
 
-from sa_jitter_ros.errors import DataWarning, one_line, SaJitterError
+from sa_jitter_ros.errors import DataWarning, one_line
 from sa_jitter_ros.json_values import json_text
 from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.loop import close_loop, Loop
@@ -68,23 +68,19 @@ def loop_file(job: LoopJob) -> LoopRow:
     """
     Close the loop on one recording, unless that was done before with the same settings.
 
-    A recording that cannot be used gives a row with the reason. Raises OSError where the folder
-    cannot be written.
+    Raises SaJitterError for a recording that cannot be used, OSError where the folder cannot be
+    written.
     """
     done = Path(job.folder, _JOB)
-    try:
-        settings = job.settings(
-            version=_VERSION, declared=Path(job.declared).read_text(encoding='utf-8'))
-        found = _finished(done)
-        if found.get('settings') == settings:
-            return LoopRow(**row_values(found['row']))
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter('always', DataWarning)
-            recording = with_pulses(
-                read(job.path, **job.options), Path(job.declared), job.tacholess)
-            loop = close_loop(recording, job.declared, names=[job.name])
-    except SaJitterError as error:
-        return LoopRow(job.name, job.path, error=str(error))
+    settings = job.settings(
+        version=_VERSION, declared=Path(job.declared).read_text(encoding='utf-8'))
+    found = _finished(done)
+    if found.get('settings') == settings:
+        return LoopRow(**row_values(found['row']))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always', DataWarning)
+        recording = with_pulses(read(job.path, **job.options), Path(job.declared), job.tacholess)
+        loop = close_loop(recording, job.declared, names=[job.name])
     loop.write(job.folder)
     row = _row(job, loop, tuple(one_line(item.message) for item in caught))
     done.write_text(json_text({'settings': settings, 'row': asdict(row)}), encoding='utf-8')
@@ -93,10 +89,9 @@ def loop_file(job: LoopJob) -> LoopRow:
 
 def _finished(path: Path) -> Mapping[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding='utf-8'))
-    except (OSError, ValueError):
+        return dict(json.loads(path.read_text(encoding='utf-8')))
+    except (OSError, TypeError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _row(job: LoopJob, loop: Loop, remarks: tuple[str, ...]) -> LoopRow:

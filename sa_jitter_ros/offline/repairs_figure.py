@@ -41,18 +41,17 @@ def repairs_figure(name: str, recording: Recording, pulses: FloatArray, rejected
     if not rejected or not (intervals > 0.0).any():
         return None
     interval = float(np.median(intervals[intervals > 0.0]))  # doubles are at the same time
-    places = worst_places(np.array([time for time, _ in rejected]), _AROUND * interval)
-    figure = Figure(figsize=(9.0, 1.5 * len(places) + 1.0), layout='constrained')
-    panels = figure.subplots(len(places), 1, squeeze=False).ravel()
+    bad = np.array([time for time, _ in rejected])
+    reach = _AROUND * interval
+    spans = [(place - reach, place + reach) for place in worst_places(bad, reach)]
+    figure = Figure(figsize=(9.0, 1.5 * len(spans) + 1.0), layout='constrained')
+    panels = figure.subplots(len(spans), 1, squeeze=False).ravel()
     figure.suptitle(f'{name}: {len(rejected)} pulses were rejected or are missing; '
-                    f'the {len(places)} worst places\n'
+                    f'the {len(spans)} worst places\n'
                     'grey: tach; blue: accepted pulses; red: rejected; dotted: missing',
                     fontsize='medium')
-    waves = _waveforms(recording, [(place - _AROUND * interval, place + _AROUND * interval)
-                                   for place in places])
-    bad = np.array([time for time, _ in rejected])
-    for panel, place, (times, wave) in zip(panels, places, waves):
-        low, high = place - _AROUND * interval, place + _AROUND * interval
+    waves = _waveforms(recording, spans)
+    for panel, (low, high), (times, wave) in zip(panels, spans, waves):
         if times.size:
             span = max(float(np.ptp(wave)), np.finfo(np.float64).tiny)
             panel.plot(times, (wave - wave.min()) / span, color=_WAVE, linewidth=0.8)

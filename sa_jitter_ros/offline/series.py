@@ -16,7 +16,7 @@ All averages of a shaft as arrays (average, ...), collected in files so that mem
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +24,10 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.averaging.results import AverageHeader, AverageMessage
 from sa_jitter_ros.pulses.resampling import periodic
 
-# Names of the arrays where they are not those of the topics, and of the header.
+# Names of the arrays where they are not those of the topics.
 _NAMES = {'synchronous_average': 'waveform'}
-_HEADER = {'mean_trigger_speed': 'trigger_speed'}
+#: Names of the arrays of the header, in its order.
+HEADER = tuple(item.name.removeprefix('mean_') for item in fields(AverageHeader))
 _OVER_ANGLE = ('waveform', 'corrected_average', 'standard_error')
 _PULSES = 'pulse_error'  # whose number differs from average to average
 # Of other arrays, the names are those of indicators.
@@ -73,8 +74,7 @@ class ShaftSeries:
     def messages(self, kinds: Collection[str], channels: Sequence[int], orders: Array
                  ) -> list[dict[str, AverageMessage]]:
         """Return the results of each average by their topics, of some channels and orders."""
-        headers = [AverageHeader(*row) for row in zip(*(
-            self[_HEADER.get(item.name, item.name)].tolist() for item in fields(AverageHeader)))]
+        headers = [AverageHeader(*row) for row in zip(*(self[name].tolist() for name in HEADER))]
         found: list[dict[str, AverageMessage]] = [{} for _ in headers]
         for kind in kinds:
             if kind in self:
@@ -121,7 +121,7 @@ class ShaftCollector:
     def __init__(self, shaft: str, folder: Path) -> None:
         self.shaft = shaft
         self._folder = folder
-        self._headers: list[dict[str, float]] = []
+        self._headers: list[tuple[float, ...]] = []
         self._spools: dict[str, _Spool] = {}
         self._names: dict[str, tuple[str, ...]] = {}
         self._pulses: list[Array] = []
@@ -138,7 +138,7 @@ class ShaftCollector:
         row = len(self._headers)
         self._notes.append([(refused or {}).get(order, '') for order in
                             results['order_amplitude'].values[0, :, 0].tolist()])
-        self._headers.append(asdict(results['synchronous_average'].header))
+        self._headers.append(astuple(results['synchronous_average'].header))
         self._angles = self._angles or results['synchronous_average'].values.shape[1]
         for topic, result in results.items():
             name = _NAMES.get(topic, topic)
@@ -156,9 +156,7 @@ class ShaftCollector:
 
     def series(self) -> ShaftSeries:
         """Return all arrays; those that are large stay in their files."""
-        arrays: dict[str, Array] = {
-            _HEADER.get(name, name): np.array([header[name] for header in self._headers])
-            for name in (self._headers[0] if self._headers else ())}
+        arrays: dict[str, Array] = dict(zip(HEADER, map(np.array, zip(*self._headers))))
         arrays |= {name: spool.rows(len(self._headers)) for name, spool in self._spools.items()}
         arrays['note'] = np.array(self._notes, dtype=np.str_)
         arrays['angle'] = np.arange(self._angles) / max(self._angles, 1)

@@ -27,7 +27,6 @@ from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
     converted, HARDWARE_ID, Parameter, require_shaft_names, unknown_names, Values)
-from sa_jitter_ros.pulses.detection import detector_of
 from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
@@ -188,14 +187,6 @@ def averager_values(machine: MachineFile, recording: Recording, *, fields: Colle
     for shaft in shafts:
         shaft_settings(values, shaft)
         gear_settings(values, shaft)
-    return values
-
-
-def detector_values(machine: MachineFile) -> Values:
-    """Return the values of the detector's parameters; raises ParameterError."""
-    values = {item.name: machine.detector.get(item.name, item.default)
-              for item in DETECTOR_PARAMETERS}
-    detector_of(values)
     return values
 
 
