@@ -96,10 +96,10 @@ def run(options: argparse.Namespace, progress: Progress) -> tuple[list[Row], Cha
     if machine.unknown:
         progress.say(f'{options.params}: ignored, because synchronous_averager has no such '
                      f'parameters: {", ".join(machine.unknown)}')
-    jobs, rows = jobs_of(options, partial(
+    jobs = jobs_of(options, partial(
         AverageJob, machine=machine, options=read_options(options),
-        figures=not options.no_figures, state=options.state,
-        tacholess=tacholess_options(options))), list[Row]()
+        figures=not options.no_figures, state=options.state, tacholess=tacholess_options(options)))
+    rows: list[Row] = []
 
     def alone(job: AverageJob) -> Row:
         done = len(rows)

@@ -180,8 +180,7 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
         nodes['tach_detector'] = {'interpolate': False, 'tach_type': PULSE_BLOCKS}
         nodes['synchronous_averager']['tach_type'] = PULSE_BLOCKS
     if live:
-        unit = '' if plan.unit == 'unknown' else plan.unit
-        nodes['live_view'] = {'vibration_unit': repr(unit), 'channel_names': plan.channels}
+        nodes['live_view'] = {'vibration_unit': repr(plan.unit), 'channel_names': plan.channels}
         nodes['residual_analyser'] = {'acquisitions': LIVE_ACQUISITIONS}
     for name in nodes.keys() - {plan.source}:
         # The nodes wait for each other first; unless live, the data end before the nodes.
@@ -305,9 +304,9 @@ def write_results(plan: Plan, results: Mapping[str, Results],
                   predictions: Mapping[str, PredictionMessage], output: Path) -> str:
     """Write arrays, table and figures of all shafts, and return a table; raises OSError."""
     file = MachineFile.read(plan.params)
-    machine, unit = file.averager, '' if plan.unit == 'unknown' else plan.unit
+    machine = file.averager
     signals = Signals(plan.title, tuple(range(len(plan.channels))), plan.channels,
-                      (unit,) * len(plan.channels), file.machine)
+                      (plan.unit,) * len(plan.channels), file.machine)
     with finished_together(output, last=ARRAYS) as folder:
         series = []
         for shaft, averages in results.items():

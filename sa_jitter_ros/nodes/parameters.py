@@ -158,8 +158,6 @@ class ParameterSet:
     def __init__(self, node: Node, specifications: Sequence[Parameter]) -> None:
         self._node = node
         self._specifications: dict[str, Parameter] = {}
-        self._check: Callable[[Values], object] = lambda values: None
-        self._apply: Callable[[Values], None] = lambda values: None
         self._following = following(self.given_values)
         #: The machine by its parts, without any where none are given.
         self.machine = Machine.among(self.given_values)

@@ -19,8 +19,7 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import KeyphasorParameters
 from sa_jitter_ros.averaging.averager import Averager
-from sa_jitter_ros.averaging.averager_parameters import (
-    gear_settings, one_ratio, PARAMETERS, shaft_parameters, shaft_settings)
+from sa_jitter_ros.averaging.averager_parameters import one_ratio, PARAMETERS, shaft_parameters
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.machine import following, Machine, PREFIX
 from sa_jitter_ros.monitoring.limits import LimitWatch
@@ -182,12 +181,8 @@ def averager_values(machine: MachineFile, recording: Recording, *, fields: Colle
         if given.get(f'{shaft}.ratio_teeth') and f'{shaft}.ratio' in given:
             raise one_ratio(given, shaft)
     known = _specifications(given)
-    values = {name: known[name].convert((found | given).get(name, item.default))
-              for name, item in known.items()}
-    for shaft in shafts:
-        shaft_settings(values, shaft)
-        gear_settings(values, shaft)
-    return values
+    return {name: known[name].convert((found | given).get(name, item.default))
+            for name, item in known.items()}
 
 
 def choose(recording: Recording) -> Suggestion:
