@@ -10,8 +10,6 @@
 
 """Figures of averages: waveform and gear signals of the latest one, orders, tracked orders."""
 
-from typing import Any
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
@@ -144,17 +142,18 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
     layout = Layout(len(signals.channels), tuple(series.orders.tolist()))
     names = [order_words(order, signals.machine.name_of(series.shaft, order))
              for order in series.orders.tolist()]
-    for number, (label, place) in enumerate(columns):
+    for (top, bottom), (label, place) in zip(panels.T, columns):
         for colour, order in enumerate(chosen.tolist()):
-            _draw(panels[0, number], panels[1, number], place, amplitude[:, order],
-                  error[:, order], _phase(phase[:, order], amplitude[:, order], noise[:, order]),
-                  color=f'C{colour}', label=f'{names[order]}, '
-                  f'{signals.channel_names[channels[order]]}')
-            draw_limits(panels[0, number], [
+            style = {'color': f'C{colour}', 'marker': '.', 'markersize': 4.0, 'linewidth': 0.8,
+                     'label': f'{names[order]}, {signals.channel_names[channels[order]]}'}
+            top.errorbar(place, amplitude[:, order], yerr=error[:, order], elinewidth=0.8, **style)
+            bottom.plot(place, _phase(
+                phase[:, order], amplitude[:, order], noise[:, order]), **style)
+            draw_limits(top, [
                 (level, bound) for level, bound, relative in signals.limits.bounds(
                     series.shaft, layout, int(channels[order]), order) if not relative],
                 names[order])
-        panels[1, number].set_xlabel(label)
+        bottom.set_xlabel(label)
     panels[0, 0].set_ylabel(f'{kind} amplitude [{signals.unit_of(channels[chosen])}]')
     panels[1, 0].set_ylabel('phase [degrees]')
     panels[0, 0].set_ylim(bottom=0.0)
@@ -171,13 +170,6 @@ def _phase(phase: Array, amplitude: Array, noise: Array) -> Array:
     found = np.full(phase.shape, np.nan)
     found[clear] = np.degrees(np.unwrap(phase[clear]))
     return found
-
-
-def _draw(top: Axes, bottom: Axes, place: Array, amplitude: Array, error: Array, phase: Array, *,
-          color: str, label: str) -> None:
-    style: dict[str, Any] = {'color': color, 'marker': '.', 'markersize': 4.0, 'linewidth': 0.8}
-    top.errorbar(place, amplitude, yerr=error, elinewidth=0.8, label=label, **style)
-    bottom.plot(place, phase, label=label, **style)
 
 
 def demodulate(waveform: Array, order: int, *, reach: int) -> tuple[Array, Array]:
