@@ -37,7 +37,7 @@ _NESTED = ('amplitude_errors', 'parts', 'envelope', 'correction')
 
 
 class ChannelGaps:
-    """Knows which channels lack samples in the cycles of an average."""
+    """Knows which channels lack samples in the cycles of a block, or of all averages so far."""
 
     def __init__(self) -> None:
         self._taken = 0
@@ -51,12 +51,9 @@ class ChannelGaps:
 
     def blank(self, average: Average, *, averaging: str, trigger_cycles: int) -> Average:
         """Return an average of the latest cycles with NaN in the channels that lack samples."""
-        reach = {'block': self._taken, 'sliding': trigger_cycles}.get(
-            averaging, _FORGOTTEN * trigger_cycles)
+        reach = trigger_cycles * (_FORGOTTEN if averaging == 'exponential' else 1)
         lacking = sorted(channel for channel, at in self._latest.items()
                          if at > self._taken - reach)
-        if averaging == 'block':
-            self._latest.clear()
         return _blanked(average, lacking) if lacking else average
 
 

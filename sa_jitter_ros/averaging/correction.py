@@ -86,7 +86,7 @@ class LatestGrid:
             for one, other in zip(cycles, self._cycles))
 
 
-class CorrectingAverager:
+class CorrectingAverager(ShaftAverager):
     """
     A `ShaftAverager` that adds to its averages what needs their cycles once more.
 
@@ -96,84 +96,35 @@ class CorrectingAverager:
 
     def __init__(self, settings: AverageSettings, grids: LatestGrid) -> None:
         self._grids = grids
-        self._shaft = ShaftAverager(settings)
-        self._cycles: list[CycleSamples] = []
-        self._gaps = ChannelGaps()
-
-    @property
-    def settings(self) -> AverageSettings:
-        """Return the present settings."""
-        return self._shaft.settings
-
-    def reset(self) -> bool:
-        """Begin again at angle 0; return whether an unfinished average was lost."""
-        self._cycles.clear()
-        self._gaps = ChannelGaps()
-        return self._shaft.reset()
-
-    def skip(self, count: int) -> bool:
-        """Leave out discarded cycles; return whether the average goes on (`ShaftAverager`)."""
-        return self._shaft.skip(count)
-
-    def begin_later(self, count: int) -> bool:
-        """Begin the block at a later cycle, as `ShaftAverager` does; return whether it could."""
-        runs = self._shaft.begin_later(count)
-        if not runs:
-            return False
-        self._cycles.clear()
-        self._gaps = ChannelGaps()
-        for run in runs:
-            self._keep(run)
-        return True
-
-    def change(self, settings: AverageSettings) -> bool:
-        """Continue at the same angle with other settings; return whether an average was lost."""
-        self._cycles.clear()
-        self._gaps = ChannelGaps()
-        return self._shaft.change(settings)
+        super().__init__(settings)
 
     def margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s at `rate` Hz needs on either side."""
         reach = math.ceil(_REACH * period * rate) if self.settings.correct_jitter else 0
-        return self._shaft.margin(period, rate) + reach
+        return super().margin(period, rate) + reach
 
-    @property
-    def room(self) -> int:
-        """Trigger cycles up to the next average."""
-        return self._shaft.room
+    def _start(self) -> None:
+        super()._start()
+        self._cycles: list[CycleSamples] = []
+        self._gaps = ChannelGaps()
 
-    def shortest(self, rate: float) -> float:
-        """Return the period (s) of a trigger cycle that is too short for samples at `rate` Hz."""
-        return self._shaft.shortest(rate)
-
-    def update(self, cycles: CycleSamples) -> Average | None:
-        """Take cycles, not more than `room`; return the average and its correction when due."""
-        average = self._shaft.update(cycles)
-        self._keep(cycles)
-        return self._completed(average)
-
-    def _keep(self, cycles: CycleSamples) -> None:
+    def _take(self, cycles: CycleSamples) -> None:
+        super()._take(cycles)
         self._gaps.take(cycles)
         if self._keeps_cycles:
             self._cycles += [cycles.part(k, k + 1) for k in range(cycles.count)]
-
-    def finish(self) -> Average | None:
-        """Return the average of the cycles of an unfinished block, None if there are none."""
-        return self._completed(self._shaft.finish())
 
     @property
     def _keeps_cycles(self) -> bool:
         return self.settings.correct_jitter or bool(self.settings.envelope.bearing_orders)
 
-    def _completed(self, average: Average | None) -> Average | None:
-        if average is None:
-            return None
-        cycles, self._cycles = self._cycles, []
+    def _result(self) -> Average:
+        average = super()._result()
         if self.settings.correct_jitter:
-            average = self._corrected(average, cycles)
+            average = self._corrected(average, self._cycles)
         if self._keeps_cycles and (
                 average.correction is None or not average.correction.accepted):
-            average = replace(average, envelope=_envelope(average, cycles, self.settings))
+            average = replace(average, envelope=_envelope(average, self._cycles, self.settings))
         return self._gaps.blank(average, averaging=self.settings.averaging,
                                 trigger_cycles=self.settings.trigger_cycles)
 

@@ -90,15 +90,15 @@ class ShaftAverager:
         self._next += count
         return True
 
-    def begin_later(self, count: int) -> list[CycleSamples]:
+    def begin_later(self, count: int) -> bool:
         """
         Begin the unfinished block at a later cycle, so that `count` discarded ones may follow.
 
-        Returns its cycles; none, and does nothing, where it cannot: the cycles are known until
-        they are averaged, which those of a large block are before it is full.
+        Returns False, and does nothing, where it cannot: the cycles are known until they are
+        averaged, which those of a large block are before it is full.
         """
         if self._counted or not self._unfinished:
-            return []
+            return False
         numbers = [*self._numbers_waiting, self._next + count]
         most = math.floor(self.settings.maximum_discarded * self.settings.trigger_cycles)
         first = next(k for k in range(len(numbers)) if _discarded(numbers[k:]) <= most)
@@ -112,7 +112,7 @@ class ShaftAverager:
             for self._next, run in kept:
                 self.update(run)
             self._next = numbers[-1]
-        return [run for _, run in kept]
+        return bool(kept)
 
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""
