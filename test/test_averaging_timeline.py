@@ -71,7 +71,7 @@ def test_memory_of_a_stretch_follows_what_it_holds(steps):
         segment = timeline.segments[0]
         assert (segment.index, segment.end_index) == (begin, end)
         np.testing.assert_array_equal(segment.samples[:, 0], np.arange(begin, end))
-        assert len(segment._data) <= max(4 * (end - begin), 1024)
+        assert len(segment._rows._data) <= max(4 * (end - begin), 1024)
 
 
 def test_time_of_a_sample_counts_from_the_first_of_its_run():
@@ -345,7 +345,7 @@ def test_a_thousand_segments_are_bounded_in_one_pass(monkeypatch):
     assert len(reads) < 4 * 1000
     assert sum(len(item.samples) for item in timeline.segments) == 2000
     assert timeline.counts.samples_dropped == 1000 + 1000
-    assert sum(len(item._data) for item in timeline.segments) < 100 * len(timeline.segments)
+    assert sum(len(item._rows._data) for item in timeline.segments) < 100 * len(timeline.segments)
     for segment in timeline.segments[::50]:
         assert segment in timeline.around(0, segment.start_time)
         assert segment in timeline.around(0, segment.end_time)

@@ -56,8 +56,8 @@ class RecoveredMarks:
         """
         Take the angles from the times of pulses `first` to `stop` of a run that begins before.
 
-        `items` are those of a `TriggerQueue`; a trigger cycle is so many `revolutions` long.
-        Pulses are remembered until `learn` has seen the average that they are in.
+        `items` are trigger pulses (`streaming.TRIGGER`); a trigger cycle is so many `revolutions`
+        long. Pulses are remembered until `learn` has seen the average that they are in.
         """
         place = first + np.flatnonzero(items['mark'][first:stop] >= 0)
         if not place.size:

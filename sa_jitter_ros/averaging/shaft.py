@@ -32,8 +32,8 @@ from sa_jitter_ros.averaging.cycle import (
     has_same_angles, joined_cycles, needed_margin, waveform_cutoff, WaveformPoints)
 from sa_jitter_ros.averaging.interpolator_gain import InterpolatorGain, mean_gain
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
-from sa_jitter_ros.averaging.latest_rows import LatestRows
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
+from sa_jitter_ros.averaging.rows import Rows
 from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, PartsMean,
                                                   RunningMean, SlidingMean)
 from sa_jitter_ros.errors import SignalError
@@ -47,6 +47,8 @@ TOGETHER = 1 << 20
 _CACHED, _FEW = 1 << 17, 1 << 11
 # Points of a trigger cycle beside which those around its ends cost little.
 _LONG = 8 * EDGE
+# Pulses (s) of a trigger cycle, and its number since the angle was 0.
+_PLACE = np.dtype([('begin', np.float64), ('end', np.float64), ('number', np.int64)])
 
 
 class ShaftAverager:
@@ -83,7 +85,8 @@ class ShaftAverager:
         Returns False, and does nothing, if they are more than the average may lack.
         """
         most = self.settings.trigger_cycles
-        numbers = [*self._numbers, *self._numbers_waiting, self._next + count][-most:]
+        numbers = [*self._places.items['number'].tolist(), *self._numbers_waiting,
+                   self._next + count][-most:]
         if not self.settings.maximum_discarded or (
                 _discarded(numbers) > self.settings.maximum_discarded * most):
             return False
@@ -170,7 +173,7 @@ class ShaftAverager:
         """
         self._take(cycles)
         self._average_waiting()
-        return np.asarray(self._amplitudes.get() * self._gains.get()[:, None])
+        return np.asarray(self._amplitudes.items * self._gains.items[:, None])
 
     def _take(self, cycles: CycleSamples) -> None:
         """Let cycles wait; raise `SignalError`."""
@@ -221,12 +224,15 @@ class ShaftAverager:
             self.settings.cycle_length / cycles.periods, self.settings.orders))
         amplitudes = self._resample(cycles) * (1.0 / gains)[:, None]
         self._amplitude_mean.update(amplitudes)
-        self._amplitudes.add(amplitudes)
-        self._gains.add(gains)
-        edges = cycles.edges.tolist()
-        self._begins.extend(edges[:-1])
-        self._ends.extend(edges[1:])
-        self._numbers.extend(range(self._cycle, self._cycle + count))
+        places = np.empty(count, _PLACE)
+        places['begin'], places['end'] = cycles.edges[:-1], cycles.edges[1:]
+        places['number'] = np.arange(self._cycle, self._cycle + count)
+        if not self._counted:
+            self._amplitudes = Rows(np.empty((0, *amplitudes.shape[1:]), np.complex128))
+        for latest, rows in ((self._amplitudes, amplitudes), (self._gains, gains),
+                             (self._places, places)):
+            latest.append(rows)
+            latest.drop(max(len(latest) - self.settings.trigger_cycles, 0))
         self._counted += count
         self._cycle += count
 
@@ -287,12 +293,9 @@ class ShaftAverager:
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_wave_mean()
         # Of the latest N_t cycles: amplitudes, and what the interpolator left of them before.
-        self._amplitudes = LatestRows(settings.trigger_cycles)
-        self._gains = LatestRows(settings.trigger_cycles)
-        # Of the latest N_t cycles: their pulses, and their numbers since the angle was 0.
-        self._begins: deque[float] = deque(maxlen=settings.trigger_cycles)
-        self._ends: deque[float] = deque(maxlen=settings.trigger_cycles)
-        self._numbers: deque[int] = deque(maxlen=settings.trigger_cycles)
+        self._amplitudes = Rows(np.empty(0))
+        self._gains = Rows(np.empty((0, len(settings.orders))))
+        self._places = Rows(np.empty(0, _PLACE))
         self._wave: FloatArray = np.empty((0, 0))
         self._next_point = 0
         self._full = False  # the waveform has all points, but its end is not reached
@@ -438,7 +441,7 @@ class ShaftAverager:
             return
         assert isinstance(self._amplitude_mean, SlidingMean)
         self._amplitude_mean.forget(self._amplitude_mean.count - self.settings.trigger_cycles)
-        whole = math.ceil(self._angle(self._numbers[0]))
+        whole = math.ceil(self._angle(int(self._places.items['number'][0])))
         while self._whole and self._whole[0] < whole:
             self._whole.popleft()
         self._wave_mean.forget(self._wave_mean.count - len(self._whole))
@@ -457,8 +460,9 @@ class ShaftAverager:
             window = math.floor(self._angle(settings.trigger_cycles))
             count = min(count, max(window, 1))
         pulses, used, seconds = self._edges()
-        cycles, gains = self._amplitudes.get(), self._gains.get()
-        numbers, speed = np.array(self._numbers), len(cycles) / seconds
+        cycles, gains = self._amplitudes.items, self._gains.items
+        cycles.flags.writeable = False
+        numbers, speed = self._places.items['number'], len(cycles) / seconds
         refused = self._gain.refused(settings.orders, gains, settings.cycle_length * speed)
         gain = mean_gain(gains, settings.orders, refused)
         amplitudes: ComplexArray = self._amplitude_mean.mean
@@ -475,7 +479,7 @@ class ShaftAverager:
             angle=np.arange(shape[0]) / max(shape[0], 1), waveform=waveform.T,
             standard_error=error.T, orders=np.array(settings.orders),
             amplitudes=amplitudes, noise=noise / gain,
-            first_angle=float(self._angle(self._numbers[0])), pulses=pulses, used=used,
+            first_angle=float(self._angle(int(numbers[0]))), pulses=pulses, used=used,
             cycle_numbers=numbers - numbers[0], cycle_amplitudes=cycles,
             amplitude_errors=scatter.errors(
                 gain * amplitudes, settings.declared_jitter(1.0 / speed)).over(gain),
@@ -485,7 +489,7 @@ class ShaftAverager:
 
     def _edges(self) -> tuple[FloatArray, NDArray[np.bool_], float]:
         """Return the pulses (s), which of them begin a cycle, and the time of all cycles."""
-        begins, ends = np.array(self._begins), np.array(self._ends)
+        begins, ends = self._places.items['begin'], self._places.items['end']
         breaks = np.flatnonzero(begins[1:] != ends[:-1])
         pulses = np.insert(np.append(begins, ends[-1]), breaks + 1, ends[breaks])
         used = np.insert(np.append(np.ones(begins.size, np.bool_), False), breaks + 1, False)
@@ -496,9 +500,9 @@ class ShaftAverager:
         """Return noise and repeatability; a sliding window renews them after an eighth of it."""
         if self._noise is None or self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
-            cycles = self._amplitudes.get() * self._gains.get()[:, None]
+            cycles = self._amplitudes.items * self._gains.items[:, None]
             clean = without_leakage(cycles, orders, cycle_length,
-                                    cycle_length * np.array(self._numbers))
+                                    cycle_length * self._places.items['number'])
             self._noise = radial_noise(clean), Repeatability.of(
                 cycles, clean, np.array(orders), cycle_length=cycle_length)
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)

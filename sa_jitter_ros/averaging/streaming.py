@@ -28,6 +28,7 @@ from sa_jitter_ros.averaging.correction import CorrectingAverager, LatestGrid
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.error_ramp import ErrorRamp
 from sa_jitter_ros.averaging.recovered_marks import RecoveredMarks
+from sa_jitter_ros.averaging.rows import Rows
 from sa_jitter_ros.averaging.shaft import TOGETHER
 from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -44,37 +45,6 @@ TRIGGER = np.dtype([('time', np.float64), ('elapsed', np.float64), ('epoch', np.
                     ('skipped', np.int64), ('starts_run', np.bool_), ('mark', np.int64)])
 
 _FEW, _SILENCE = 3, 1.0  # trigger cycles and s: longer gaps of the pulses are said
-
-
-class TriggerQueue:
-    """Trigger pulses in an array (`items`), added at the end and removed at the start."""
-
-    def __init__(self) -> None:
-        self._data = np.empty(64, TRIGGER)
-        self._begin = self._end = 0
-
-    def __len__(self) -> int:
-        """Return the number of pulses."""
-        return self._end - self._begin
-
-    @property
-    def items(self) -> NDArray[Any]:
-        """Return the pulses, without a copy."""
-        return self._data[self._begin:self._end]
-
-    def append(self, items: NDArray[Any]) -> None:
-        """Add pulses behind the last one."""
-        if self._end + len(items) > len(self._data):
-            kept = self.items
-            self._data = np.empty(2 * (len(kept) + len(items)), TRIGGER)
-            self._data[:len(kept)] = kept
-            self._begin, self._end = 0, len(kept)
-        self._data[self._end:self._end + len(items)] = items
-        self._end += len(items)
-
-    def drop(self, count: int) -> None:
-        """Remove the first `count` pulses."""
-        self._begin += count
 
 
 @dataclass
@@ -127,7 +97,7 @@ class StreamingAverager:
         self.shafts = {name: CorrectingAverager(settings, self._grids)
                        for name, settings in shafts.items()}
         self._law = angle_law(next(iter(shafts.values())).angle_law)
-        self._triggers = TriggerQueue()  # of which the next cycle begins at _next
+        self._triggers = Rows(np.empty(0, TRIGGER))  # of which the next cycle begins at _next
         self._next = 0
         self._run = 0  # where the run of the next cycle begins
         self._pulse_epoch = 0
@@ -205,7 +175,7 @@ class StreamingAverager:
         count = int(np.count_nonzero(~waiting['starts_run'][1:]))
         if count:
             self._discard(count, f'no vibration from {waiting["time"][0]:.6f} s on')
-        self._triggers = TriggerQueue()
+        self._triggers = Rows(np.empty(0, TRIGGER))
         self._next = 0
         self._begin_run()
         due, self._due = self._due, []
@@ -225,7 +195,7 @@ class StreamingAverager:
         self._recovered = RecoveredMarks(validator.pulses_per_revolution)
         self._ramps = {name: ErrorRamp() for name in self.shafts}
         self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
-        self._triggers, self._last_time = TriggerQueue(), np.nan
+        self._triggers, self._last_time = Rows(np.empty(0, TRIGGER)), np.nan
         self._next = 0
         self._begin_run()
 

@@ -22,8 +22,9 @@ import math
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
+from sa_jitter_ros.averaging.rows import Rows
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.inner_loops import frames, room
+from sa_jitter_ros.inner_loops import frames
 from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved_times
 
 _Span = tuple[int, int]  # first index, and the one behind the last
@@ -58,31 +59,26 @@ class Segment:
 
     def __init__(self, clock: SampleClock, epoch: int, index: int, channels: int) -> None:
         self.clock, self.epoch, self.closed = clock, epoch, False
-        self._data = room((0, channels))
         self.lacks_channels = False
-        self._begin = self._end = 0
-        self._index = self._settled = index  # samples before `_settled` are counted
+        self.index = index  # of the first sample held
+        self._settled = index  # samples before it are counted
+        self._rows = Rows(np.empty((0, channels)))
         self._begins_run = index == clock.index
-
-    @property
-    def index(self) -> int:
-        """Index of the first sample."""
-        return self._index + self._begin
 
     @property
     def end_index(self) -> int:
         """Index after the last sample."""
-        return self._index + self._end
+        return self.index + self.size
 
     @property
     def size(self) -> int:
         """Number of samples held."""
-        return self._end - self._begin
+        return len(self._rows)
 
     @property
     def samples(self) -> FloatArray:
         """Return the samples as (sample, channel), without a copy."""
-        return self._data[self._begin:self._end]
+        return self._rows.items
 
     @property
     def start_time(self) -> float:
@@ -105,17 +101,10 @@ class Segment:
         It is not where a number is not finite and no `gaps` are allowed.
         """
         count = samples.shape[1]
-        if self._end + count > len(self._data):
-            kept = self.samples
-            size = max(4 * (len(kept) + count), 64)
-            data = room((size, kept.shape[1]))
-            data[:len(kept)] = kept
-            self._index, self._data = self.index, data
-            self._begin, self._end = 0, len(kept)
-        finite = frames(np.asarray(samples, np.float64), self._data[self._end:self._end + count])
+        finite = frames(np.asarray(samples, np.float64), self._rows.space(count))
         if not (finite or gaps):
             return False
-        self._end += count
+        self._rows.add(count)
         return True
 
     def use(self, low: float, high: float) -> int:
@@ -135,8 +124,8 @@ class Segment:
         """Remove the samples before `index`; return how many of them were not averaged."""
         end = min(max(index, self.index), self.end_index)
         unused = max(end - self._settled, 0)
-        self._begin += end - self.index
-        self._settled = max(self._settled, end)
+        self._rows.drop(end - self.index)
+        self.index, self._settled = end, max(self._settled, end)
         return unused
 
 

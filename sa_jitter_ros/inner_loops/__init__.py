@@ -13,7 +13,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike
+from sa_jitter_ros.arrays import Array
 
 try:
     from sa_jitter_ros.inner_loops._in_c import add_products, add_steps, frames, weighted_sums
@@ -25,7 +26,7 @@ __all__ = ['add_products', 'add_steps', 'frames', 'room', 'weighted_sums']
 _LINE = 64  # bytes of a line of the cache, and of the largest register
 
 
-def room(shape: tuple[int, ...]) -> NDArray[np.float64]:
+def room(shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> Array:
     """
     Return an array that is not filled and begins with a line of the cache.
 
@@ -34,7 +35,7 @@ def room(shape: tuple[int, ...]) -> NDArray[np.float64]:
     >>> room((3, 8)).ctypes.data % 64
     0
     """
-    size = 8 * math.prod(shape)
+    size = np.dtype(dtype).itemsize * math.prod(shape)
     memory = np.empty(size + _LINE, np.uint8)
     begin = -memory.ctypes.data % _LINE
-    return memory[begin:begin + size].view(np.float64).reshape(shape)
+    return memory[begin:begin + size].view(dtype).reshape(shape)
