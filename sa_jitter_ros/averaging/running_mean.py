@@ -9,7 +9,7 @@
 # the License.
 
 """
-Running means of arrays: block, sliding and exponential.
+Running means of real arrays: block, sliding and exponential.
 
 Each takes one array per cycle, of some cycles at once with `update`, and returns `mean` and
 `standard_error`. Memory does not grow with the number of cycles (a sliding mean keeps its window).
@@ -25,18 +25,10 @@ Undefined values are NaN.
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import DTypeLike
-from sa_jitter_ros.arrays import Array, FloatArray
+from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.inner_loops import add_steps
 
 _CACHED = 1 << 16  # numbers
-
-
-def _power(values: Array) -> FloatArray:
-    """Return the squared magnitude."""
-    if np.iscomplexobj(values):
-        return np.asarray(np.square(values.real) + np.square(values.imag))
-    return np.asarray(np.square(values))
 
 
 class RunningMean(Protocol):
@@ -46,11 +38,11 @@ class RunningMean(Protocol):
     def count(self) -> int:
         """Return the number of arrays that make the mean."""
 
-    def update(self, values: Array) -> None:
+    def update(self, values: FloatArray) -> None:
         """Take the arrays of one or more cycles (cycle, ...), at least one."""
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> FloatArray:
         """Mean so far."""
 
     @property
@@ -69,38 +61,33 @@ class BlockMean:
 
     def __init__(self) -> None:
         self.count = 0
-        self._first: Array = np.array(np.nan)
-        self._sum: Array = np.array(np.nan)
+        self._first: FloatArray = np.array(np.nan)
+        self._sum: FloatArray = np.array(np.nan)
         self._squares: FloatArray = np.array(np.nan)
         self._new = False  # the arrays that are expected begin with the first one
 
-    def update(self, values: Array) -> None:
+    def update(self, values: FloatArray) -> None:
         """Take one or more arrays (cycle, ...), at least one."""
         values = np.ascontiguousarray(values)
-        self.expect(len(values), values.shape[1:], values.dtype)
+        self.expect(len(values), values.shape[1:])
         # Piece by piece, so that what is computed of a piece stays in the cache.
         size = max(_CACHED // (values[:, :1].size or 1), 1)
         for first in range(0, values.shape[1], size):
             self.put(slice(first, first + size), values[:, first:first + size])
 
-    def expect(self, count: int, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> None:
+    def expect(self, count: int, shape: tuple[int, ...]) -> None:
         """Begin to take `count` arrays of this shape, which `put` brings piece by piece."""
         self._new = not self.count
         if self._new:
-            self._first, self._sum = np.empty(shape, dtype), np.zeros(shape, dtype)
-            self._squares = np.zeros(shape)
+            self._first = np.empty(shape)
+            self._sum, self._squares = np.zeros((2, *shape))
         self.count += count
 
-    def put(self, where: slice, values: Array) -> None:
+    def put(self, where: slice, values: FloatArray) -> None:
         """Take a piece (cycle, where, ...) of the arrays that are expected."""
         if self._new:
             self._first[where] = values[0]
-        if values.dtype == np.float64:
-            add_steps(values, self._first[where], self._sum[where], self._squares[where])
-            return
-        steps = values - self._first[where]
-        self._sum[where] += steps.sum(axis=0)
-        self._squares[where] += _power(steps).sum(axis=0)
+        add_steps(values, self._first[where], self._sum[where], self._squares[where])
 
     def merge(self, other: 'BlockMean') -> None:
         """Add all arrays of another mean."""
@@ -114,12 +101,12 @@ class BlockMean:
         moved = other.count * step
         self._sum += other._sum + moved
         moved += 2.0 * other._sum
-        moved *= np.conj(step)
-        self._squares += other._squares + moved.real
+        moved *= step
+        self._squares += other._squares + moved
         self.count += other.count
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> FloatArray:
         """Mean so far."""
         return np.asarray(self._first + self._sum / self.count if self.count else self._first)
 
@@ -128,7 +115,7 @@ class BlockMean:
         """Return the standard error of the mean; NaN below two arrays."""
         if self.count < 2:
             return np.full(self._squares.shape, np.nan)
-        squares = np.maximum(self._squares - _power(self._sum) / self.count, 0.0)
+        squares = np.maximum(self._squares - np.square(self._sum) / self.count, 0.0)
         return np.asarray(np.sqrt(squares / (self.count - 1) / self.count))
 
 
@@ -153,7 +140,7 @@ class PartsMean(BlockMean):
         self._parts: list[BlockMean] = []
         self._expected: list[tuple[BlockMean, slice]] = []  # which cycles belong to which part
 
-    def expect(self, count: int, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> None:
+    def expect(self, count: int, shape: tuple[int, ...]) -> None:
         """Begin to take `count` arrays of this shape, which `put` brings piece by piece."""
         self.count += count
         while self.count > 2 * self._least * self._size:
@@ -164,11 +151,11 @@ class PartsMean(BlockMean):
                 self._parts.append(BlockMean())
             part = self._parts[-1]
             end = min(begin + self._size - part.count, count)
-            part.expect(end - begin, shape, dtype)
+            part.expect(end - begin, shape)
             self._expected.append((part, slice(begin, end)))
             begin = end
 
-    def put(self, where: slice, values: Array) -> None:
+    def put(self, where: slice, values: FloatArray) -> None:
         """Take a piece (cycle, where, ...) of the arrays that are expected."""
         for part, cycles in self._expected:
             part.put(where, values[cycles])
@@ -191,7 +178,7 @@ class PartsMean(BlockMean):
         return total
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> FloatArray:
         """Mean so far."""
         return self.together().mean
 
@@ -218,7 +205,7 @@ class SlidingMean:
     """
 
     def __init__(self) -> None:
-        self._latest: list[Array] = []
+        self._latest: list[FloatArray] = []
         self._sum = BlockMean()  # of the latest
         self._older: list[BlockMean] = []
 
@@ -227,7 +214,7 @@ class SlidingMean:
         """Return the number of arrays in the window."""
         return len(self._latest) + len(self._older)
 
-    def update(self, values: Array) -> None:
+    def update(self, values: FloatArray) -> None:
         """Take one or more arrays (cycle, ...), which must not be changed later."""
         self._latest.extend(values)
         self._sum.update(values)
@@ -257,7 +244,7 @@ class SlidingMean:
         return window
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> FloatArray:
         """Mean of the window."""
         return self._window().mean
 
@@ -284,16 +271,16 @@ class ExponentialMean:
     def __init__(self, cycles: float) -> None:
         self._weight = 2.0 / (cycles + 1.0)
         self.count = 0
-        self._mean: Array = np.array(np.nan)
+        self._mean: FloatArray = np.array(np.nan)
         self._variance: FloatArray = np.array(np.nan)
         self._squared_weights = 0.0
 
-    def update(self, values: Array) -> None:
+    def update(self, values: FloatArray) -> None:
         """Take one or more arrays (cycle, ...)."""
         for item in values:
             self._take(item)
 
-    def _take(self, values: Array) -> None:
+    def _take(self, values: FloatArray) -> None:
         self.count += 1
         weight = max(self._weight, 1.0 / self.count)
         if self.count == 1:
@@ -304,11 +291,11 @@ class ExponentialMean:
             undefined = np.isnan(self._mean)
             self._mean = np.where(undefined, values, self._mean + weight * step)
             self._variance = np.where(
-                undefined, 0.0, (1.0 - weight) * (self._variance + weight * _power(step)))
+                undefined, 0.0, (1.0 - weight) * (self._variance + weight * np.square(step)))
         self._squared_weights = (1.0 - weight) ** 2 * self._squared_weights + weight**2
 
     @property
-    def mean(self) -> Array:
+    def mean(self) -> FloatArray:
         """Mean so far."""
         return self._mean.copy()
 

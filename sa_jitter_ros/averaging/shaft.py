@@ -223,7 +223,8 @@ class ShaftAverager:
         gains = self._gain.gains(np.multiply.outer(
             self.settings.cycle_length / cycles.periods, self.settings.orders))
         amplitudes = self._resample(cycles) * (1.0 / gains)[:, None]
-        self._amplitude_mean.update(amplitudes)
+        # Real and imaginary parts have means of their own.
+        self._amplitude_mean.update(np.ascontiguousarray(amplitudes).view(np.float64))
         places = np.empty(count, _PLACE)
         places['begin'], places['end'] = cycles.edges[:-1], cycles.edges[1:]
         places['number'] = np.arange(self._cycle, self._cycle + count)
@@ -465,7 +466,7 @@ class ShaftAverager:
         numbers, speed = self._places.items['number'], len(cycles) / seconds
         refused = self._gain.refused(settings.orders, gains, settings.cycle_length * speed)
         gain = mean_gain(gains, settings.orders, refused)
-        amplitudes: ComplexArray = self._amplitude_mean.mean
+        amplitudes: ComplexArray = self._amplitude_mean.mean.view(np.complex128)
         if refused:
             cycles, amplitudes = (np.where(np.isnan(gain), np.nan, item)
                                   for item in (cycles, amplitudes))
