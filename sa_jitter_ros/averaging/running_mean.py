@@ -64,30 +64,19 @@ class BlockMean:
         self._first: FloatArray = np.array(np.nan)
         self._sum: FloatArray = np.array(np.nan)
         self._squares: FloatArray = np.array(np.nan)
-        self._new = False  # the arrays that are expected begin with the first one
 
     def update(self, values: FloatArray) -> None:
         """Take one or more arrays (cycle, ...), at least one."""
         values = np.ascontiguousarray(values)
-        self.expect(len(values), values.shape[1:])
+        if not self.count:
+            self._first = values[0].copy()
+            self._sum, self._squares = np.zeros((2, *self._first.shape))
+        self.count += len(values)
         # Piece by piece, so that what is computed of a piece stays in the cache.
         size = max(_CACHED // (values[:, :1].size or 1), 1)
-        for first in range(0, values.shape[1], size):
-            self.put(slice(first, first + size), values[:, first:first + size])
-
-    def expect(self, count: int, shape: tuple[int, ...]) -> None:
-        """Begin to take `count` arrays of this shape, which `put` brings piece by piece."""
-        self._new = not self.count
-        if self._new:
-            self._first = np.empty(shape)
-            self._sum, self._squares = np.zeros((2, *shape))
-        self.count += count
-
-    def put(self, where: slice, values: FloatArray) -> None:
-        """Take a piece (cycle, where, ...) of the arrays that are expected."""
-        if self._new:
-            self._first[where] = values[0]
-        add_steps(values, self._first[where], self._sum[where], self._squares[where])
+        for begin in range(0, values.shape[1], size):
+            where = slice(begin, begin + size)
+            add_steps(values[:, where], self._first[where], self._sum[where], self._squares[where])
 
     def merge(self, other: 'BlockMean') -> None:
         """Add all arrays of another mean."""
@@ -138,27 +127,18 @@ class PartsMean(BlockMean):
         super().__init__()
         self._size, self._least = size, least
         self._parts: list[BlockMean] = []
-        self._expected: list[tuple[BlockMean, slice]] = []  # which cycles belong to which part
 
-    def expect(self, count: int, shape: tuple[int, ...]) -> None:
-        """Begin to take `count` arrays of this shape, which `put` brings piece by piece."""
-        self.count += count
+    def update(self, values: FloatArray) -> None:
+        """Take one or more arrays (cycle, ...), at least one."""
+        self.count += len(values)
         while self.count > 2 * self._least * self._size:
             self._double()
-        self._expected, begin = [], 0
-        while begin < count:
+        while len(values):
             if not self._parts or self._parts[-1].count == self._size:
                 self._parts.append(BlockMean())
-            part = self._parts[-1]
-            end = min(begin + self._size - part.count, count)
-            part.expect(end - begin, shape)
-            self._expected.append((part, slice(begin, end)))
-            begin = end
-
-    def put(self, where: slice, values: FloatArray) -> None:
-        """Take a piece (cycle, where, ...) of the arrays that are expected."""
-        for part, cycles in self._expected:
-            part.put(where, values[cycles])
+            count = self._size - self._parts[-1].count
+            self._parts[-1].update(values[:count])
+            values = values[count:]
 
     def _double(self) -> None:
         for first, second in zip(self._parts[::2], self._parts[1::2]):

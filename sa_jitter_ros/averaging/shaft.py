@@ -17,7 +17,7 @@ a fraction of the same for each of them. The settings limit its memory.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from itertools import pairwise
 import math
@@ -324,10 +324,9 @@ class ShaftAverager:
             self._law, u, method=method, cutoff=cutoff, ahead=points.ahead, kept=inside))
         return self._project(cycles, size)
 
-    def _project(self, cycles: CycleSamples, size: int,
-                 take: Callable[[slice, FloatArray], None] = lambda where, values: None
+    def _project(self, cycles: CycleSamples, size: int, every: FloatArray | None = None
                  ) -> ComplexArray:
-        """Return the amplitudes from a grid of so many points, whose pieces `take` gets, too."""
+        """Return the amplitudes from a grid of so many points, which is written to `every`."""
         count, channels = cycles.count, cycles.samples.shape[1]
         projection = CycleProjection(size, self.settings.cycle_length, self.settings.orders)
         piece, u = size, np.arange(size) / size
@@ -339,25 +338,14 @@ class ShaftAverager:
             values = cycles.at(self._law, u[where], method=self.settings.interpolation).reshape(
                 count, -1, channels)
             projection.add(begin, values)
-            take(where, values)
+            if every is not None:
+                every[:, where] = values
         return projection.amplitudes(cycles.end(method=self.settings.interpolation), self._cycle)
 
     def _resample_even(self, cycles: CycleSamples, points: WaveformPoints) -> ComplexArray:
         """As `_resample`, with the points of the waveform at the same angles of every cycle."""
-        mean, size = self._wave_mean, int(points.number[0])
-        if (isinstance(mean, BlockMean) and size == self._points
-                and self._next_point == points.first[0]):
-            # Trigger cycles that are the fundamental cycles need not be put together.
-            mean.expect(cycles.count, self._wave.shape)
-            amplitudes = self._project(cycles, size, mean.put)
-            self._next_point += cycles.count * size
-            return amplitudes
-        every = np.empty((cycles.count, size, cycles.samples.shape[1]))
-
-        def take(where: slice, values: FloatArray) -> None:
-            every[:, where] = values
-
-        amplitudes = self._project(cycles, size, take)
+        every = np.empty((cycles.count, int(points.number[0]), cycles.samples.shape[1]))
+        amplitudes = self._project(cycles, every.shape[1], every)
         self._add_points(points, every.reshape(-1, every.shape[2]))
         return amplitudes
 
