@@ -42,7 +42,6 @@ class CombSpectra:
     evidence: NDArray[np.float32]
     times: FloatArray
     step: float
-    length: float
 
 
 def spectra_of(vibration: FloatArray, sample_rate: float, seconds: float, highest: float
@@ -80,7 +79,7 @@ def spectra_of(vibration: FloatArray, sample_rate: float, seconds: float, highes
     evidence[seen == 0] = 0.0
     evidence[:, 0] = 0.0
     return CombSpectra(evidence.astype(np.float32), (starts + size / 2.0) / sample_rate,
-                       sample_rate / size, size / sample_rate)
+                       sample_rate / size)
 
 
 def _floor(power: FloatArray) -> FloatArray:

@@ -159,11 +159,9 @@ def _finer(vibration: FloatArray, sample_rate: float, orders: FloatArray, rough:
     count = int(np.clip(2.5 * orders.max() * (angle[-1] - angle[0]), samples // 4, 2 * samples))
     even = np.linspace(angle[0], angle[-1], count)
     rate = (count - 1) / (angle[-1] - angle[0])
-    times = np.interp(even, angle, np.arange(samples) / sample_rate)
-    place = times * sample_rate
-    before = np.minimum(place.astype(np.intp), samples - 2)
-    share = place - before
-    turned = vibration[:, before] * (1.0 - share) + vibration[:, before + 1] * share
+    clock = np.arange(samples) / sample_rate
+    times = np.interp(even, angle, clock)
+    turned = np.array([np.interp(times, clock, channel) for channel in vibration])
     seconds = _STILL / spacing  # a turn is the second of this time
     if ((angle[-1] - angle[0]) / seconds - 1.0) * 4.0 < _FRAMES:
         return rough

@@ -110,7 +110,6 @@ class Posterior:
 
     def __init__(self, seen: Seen, walk: Walk) -> None:
         rows = seen.rows
-        self.unit = seen.unit
         count, width = len(seen.nodes), rows.shape[2] // 2
         prior = _Prior(np.diff(seen.nodes) / seen.unit, width, walk)
         weighted = seen.precision.T[..., None] * rows
