@@ -140,7 +140,9 @@ def test_bent_averages_keep_their_mean_square_in_noise():
 def test_sampled_distribution_is_that_of_few_cycles(cycles):
     distribution, order, noise = Triangular(0.25), 0.7, 0.02
     moments, _ = jittered(distribution, order, cycles)
-    drawn, unit_noise = drawn_averages([order], [IndependentPulseJitter(distribution)], cycles)
+    model = DeclaredModel(keyphasor_rate=1e3, trigger_speed=1.0, trigger_cycles=cycles,
+                          orders=(order,))
+    drawn, unit_noise = drawn_averages(model, [IndependentPulseJitter(distribution)])
     sampled = distribution_of(drawn + np.sqrt(noise) * unit_noise,
                               Parts.about(1.0, moments.with_noise(noise)))
     assert sampled.mean_square[0] == pytest.approx(moments.with_noise(noise).mean_square[0])

@@ -167,7 +167,7 @@ def unit_amplitudes(model: DeclaredModel, influences: Sequence[Influence] = ()) 
         return _drawn(model, processes, gain, known)
     if known:
         errors = _affordable(model, processes, _combined([errors for _, errors in known]))
-        return _pooled(model, processes, errors, gain)
+        return known_amplitudes(model, processes, errors, gain=gain, apart=False)
     return _of_random(model, processes, gain)
 
 
@@ -216,20 +216,25 @@ def _of_random(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gai
 
 
 def known_amplitudes(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
-                     *, gain: ArrayLike = 1.0) -> Amplitudes:
+                     *, gain: ArrayLike = 1.0, apart: bool = True) -> Amplitudes:
     """
     Return the amplitudes of averages whose pulse `errors` (scenario, n) in s are known.
 
-    `processes` are what is random beside. Where these are independent errors, the distribution is
-    curved for few cycles, too: the few hundred draws that one average is worth come no closer.
+    `processes` are what is random beside. Scenarios are equally likely; where they are kept
+    `apart`, each has a distribution of its own. Under independent errors that is curved for few
+    cycles, too: the few hundred draws that one average is worth come no closer.
     """
     gain = np.asarray(gain) * np.ones(len(model.orders))
     found, cycles = _with_errors(model, processes, errors, gain)
     count = model.trigger_cycles
     independent = all(isinstance(process, IndependentPulseJitter) for process in processes)
-    if not independent and few_cycles(cycles, count, None) and count <= most_cycles(
-            processes, len(model.orders)):
-        return _with_draws(found, model, processes, gain, errors, apart=True)
+    if apart:
+        few = not independent and few_cycles(cycles, count, None)
+    else:
+        few = count <= _FEW_CYCLES_OF_SCENARIOS or few_cycles(
+            cycles, count, _FEW_CYCLES_OF_SCENARIOS if independent else None)
+    if few and count <= most_cycles(processes, len(model.orders)):
+        return _with_draws(found, model, processes, gain, errors, apart=apart)
     return found
 
 
@@ -323,28 +328,13 @@ def _with_errors(model: DeclaredModel, processes: Sequence[AngleErrorProcess], e
     return _of_parts(parts, gain), cycles
 
 
-def _pooled(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
-            gain: Array) -> Amplitudes:
-    """Return amplitudes that give each scenario the same probability."""
-    count = model.trigger_cycles
-    found, cycles = _with_errors(model, processes, errors, gain)
-    independent = all(isinstance(process, IndependentPulseJitter) for process in processes)
-    few = count <= _FEW_CYCLES_OF_SCENARIOS or few_cycles(
-        cycles, count, _FEW_CYCLES_OF_SCENARIOS if independent else None)
-    if few and count <= most_cycles(processes, len(model.orders)):
-        return _with_draws(found, model, processes, gain, errors)
-    return found
-
-
 def _with_draws(found: Amplitudes, model: DeclaredModel, processes: Sequence[AngleErrorProcess],
                 gain: Array, errors: Array | None = None, *, apart: bool = False) -> Amplitudes:
     """Return the amplitudes with draws, in each scenario as many where they are kept `apart`."""
     cycles = None if errors is None else errors * model.fundamental_frequency
     known = None if apart or cycles is None else lambda n: cycles[
         (len(cycles) * (_GOLDEN * np.arange(n) % 1.0)).astype(int)]
-    draws, noise = drawn_averages(model.orders, processes, model.trigger_cycles, known=known,
-                                  weights=model.weights, each=cycles if apart else None,
-                                  spread=max(model.orders) * angle_spread(processes))
+    draws, noise = drawn_averages(model, processes, known=known, each=cycles if apart else None)
     return replace(found, draws=_grown(draws, gain), noise=noise)
 
 
@@ -369,9 +359,7 @@ def _drawn(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: A
             total = total + rows
         return total * model.fundamental_frequency
 
-    draws, noise = drawn_averages(model.orders, processes, model.trigger_cycles,
-                                  weights=model.weights, known=known,
-                                  spread=max(model.orders) * angle_spread(processes))
+    draws, noise = drawn_averages(model, processes, known=known)
     moments = influences[0][0].exact_moments(model, processes) if len(influences) == 1 else None
     if moments is None:
         moments = moments_of(draws)

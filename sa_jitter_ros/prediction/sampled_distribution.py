@@ -25,11 +25,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, unit_nodes
+from sa_jitter_ros.prediction.angle_error import angle_spread, AngleErrorProcess, unit_nodes
 from sa_jitter_ros.prediction.distributions import Empirical
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 from sa_jitter_ros.prediction.parts import offset_of, Parts
-from sa_jitter_ros.pulses.angle_law import LINEAR, PulseWeights
+from sa_jitter_ros.pulses.angle_law import LINEAR
 
 #: ``known(count)``: pulse errors (count, pulse) in fundamental cycles of as many averages.
 KnownErrors = Callable[[int], Array]
@@ -159,24 +160,24 @@ def most_cycles(processes: Sequence[AngleErrorProcess], orders: int) -> int:
     return most // (1 if pulsed else _PLACES)
 
 
-def drawn_averages(orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
-                   weights: PulseWeights = LINEAR, known: KnownErrors | None = None,
-                   each: Array | None = None, spread: float = 0.0) -> tuple[Array, Array]:
+def drawn_averages(model: DeclaredModel, processes: Sequence[Any], *,
+                   known: KnownErrors | None = None, each: Array | None = None
+                   ) -> tuple[Array, Array]:
     """
-    Return X - 1 (order, draw) of averages of `trigger_cycles` cycles, and noise, E|n|^2 1.
+    Return X - 1 (order, draw) of averages of a `model`, and noise, E|n|^2 1.
 
-    `processes` can be drawn (`most_cycles`); `weights` are those of the angle law.
+    `processes` can be drawn (`most_cycles`).
     ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come on top of the
     random ones, of all N_t - 1 + weights.pulses pulses or of the average's own N_t + 1. The errors
     `each` (scenario, n) come on top of the same random ones each, so that draws are (order,
-    scenario, draw). `spread` is the standard deviation of the random errors in cycles of the
-    highest order.
+    scenario, draw).
 
     Both parts of X - 1 are right to some digits of single precision, relative to themselves. They
     have double precision of tables of few values, where averages have few, too, and of errors too
     large or too small for single precision.
     """
-    g = np.asarray(orders, float)
+    g, trigger_cycles, weights = np.asarray(model.orders), model.trigger_cycles, model.weights
+    spread = max(model.orders) * angle_spread(processes)
     pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
     inside = [process for process in processes if process not in pulsed]
     bare = weights is LINEAR and not inside
