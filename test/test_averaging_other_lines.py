@@ -14,7 +14,7 @@
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
-from sa_jitter_ros.averaging.cycle import project
+from sa_jitter_ros.averaging.cycle import CycleProjection
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.other_lines import coherent, other_lines
 
@@ -124,7 +124,9 @@ def test_lines_are_found_at_their_orders(ratio, rng):
     near = found[np.argmin(np.abs(found[:, None] - others), axis=0)]
     assert np.abs(near - others).max() < 0.1 / (cycles * ratio)
     rough = others + 0.3 / (cycles * ratio)
-    amplitudes = project(samples[:, None], ratio, tuple(rough), count=cycles)
+    projection = CycleProjection(samples.size // cycles, ratio, tuple(rough))
+    projection.add(0, samples[:-1].reshape(cycles, -1, 1))
+    amplitudes = projection.amplitudes(samples[-1:])
     exact = coherent(rough, amplitudes, np.arange(cycles), ratio)
     assert np.abs(exact - others).max() < 0.03 / (cycles * ratio)
 

@@ -106,11 +106,6 @@ class AmplitudeErrors:
         return AmplitudeErrors(self.amplitude / gain, self.phase + 0.0 * gain,
                                self.upper_95 / gain)
 
-    @classmethod
-    def unknown(cls, shape: tuple[int, ...]) -> 'AmplitudeErrors':
-        """Return errors of which nothing is known."""
-        return cls(*(np.full(shape, np.nan) for _ in range(3)))
-
 
 def widened(error: FloatArray, freedom: FloatArray | float) -> FloatArray:
     """

@@ -55,12 +55,12 @@ class LatestGrid:
     """Grids of the latest trigger cycles that were corrected: several shafts may have the same."""
 
     def __init__(self) -> None:
-        self._method, self._cycles = '', list[CycleSamples]()
+        self._key: tuple[str, bytes] | None = None
         self._found: Grid | None = None
 
     def forget(self) -> None:
-        """Free the memory."""
-        self._cycles, self._found = [], None
+        """Free the memory: the cycles that come have other samples."""
+        self._key = self._found = None
 
     def of(self, cycles: list[CycleSamples], method: str, numbers: NDArray[np.int64]) -> Grid:
         """
@@ -70,20 +70,15 @@ class LatestGrid:
         result has those channels only which tell of the pulse errors, as the third (channel,)
         says; if none does, all.
         """
-        if self._found is None or not self._has(cycles, method):
+        key = method, np.array([cycle.edges for cycle in cycles]).tobytes()
+        if self._found is None or key != self._key:
             grid = cycle_grid(cycles, method=method)
             informative = telling(grid, cycles)
             if not informative.any():
                 informative[:] = True
-            self._method, self._cycles = method, cycles
             seen = grid if informative.all() else grid[..., informative]
-            self._found = grid, GridCycles(seen, numbers), informative
+            self._key, self._found = key, (grid, GridCycles(seen, numbers), informative)
         return self._found
-
-    def _has(self, cycles: list[CycleSamples], method: str) -> bool:
-        return method == self._method and len(cycles) == len(self._cycles) and all(
-            one.samples is other.samples and np.array_equal(one.edges, other.edges)
-            for one, other in zip(cycles, self._cycles))
 
 
 class CorrectingAverager(ShaftAverager):
@@ -372,13 +367,10 @@ def _refitted(raw: Average, cycles: list[CycleSamples], settings: AverageSetting
     The second result is the number of these.
     """
     recovery, grid = _recovered(raw, cycles, settings, grids, orders)
-    begins = np.flatnonzero(raw.used)
     moved = np.zeros(raw.pulses.size)
     for _ in range(_ROUNDS):
-        late = displacements(
-            grid, recovery, raw.cycle_numbers, begins, cycle_length=settings.cycle_length,
-            period=float(np.mean(raw.periods)), first_angle=raw.first_angle,
-            declared=_declared(cycles, settings))
+        late = displacements(grid, recovery, raw, cycle_length=settings.cycle_length,
+                             declared=_declared(cycles, settings))
         if not late.any():
             break
         if np.abs(late).max() > _REACH * raw.periods.min():  # which is refused
@@ -442,7 +434,7 @@ def _uncorrected(raw: Average, reason: str) -> Correction:
     return Correction(
         raw.waveform, raw.amplitudes, raw.noise, np.zeros(len(raw.pulses)),
         np.full(len(raw.pulses), np.nan), False, reason, unknown, unknown, raw.cycle_amplitudes,
-        AmplitudeErrors.unknown(raw.amplitudes.shape), raw.parts)
+        AmplitudeErrors(unknown, unknown, unknown), raw.parts)
 
 
 def _between(raw: Average, cycles: Sequence[CycleSamples], pulses: FloatArray

@@ -387,26 +387,6 @@ def _turned(whole: IntArray, rest: FloatArray, orders: tuple[float, ...]) -> Com
                                  + np.multiply.outer(rest, orders)))
 
 
-def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], *, first_cycle: int = 0,
-            count: int = 1) -> ComplexArray:
-    """
-    Return the complex peak amplitudes (cycle, channel, order) of consecutive trigger cycles.
-
-    `grid` (count x points + 1, channel) are the values of `count` cycles of `cycles` fundamental
-    cycles at equal steps of angle, and the last end. The first is number `first_cycle` of those
-    since angle 0, to which phases refer.
-
-    >>> theta = np.linspace(0.0, 1.0, 65)
-    >>> wave = 3.0 * np.cos(2.0 * np.pi * 4.0 * theta)[:, None]
-    >>> abs(project(wave, 1.0, (4.0, 5.0))).round(6)
-    array([[[3., 0.]]])
-    """
-    points = (len(grid) - 1) // count
-    projection = CycleProjection(points, cycles, orders)
-    projection.add(0, grid[:-1].reshape(count, points, -1))
-    return projection.amplitudes(grid[-1], first_cycle)
-
-
 @dataclass(frozen=True)
 class WaveformPoints:
     """

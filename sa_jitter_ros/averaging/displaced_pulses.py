@@ -19,6 +19,7 @@ pulse counts as missing: it is put where the vibration has it, and the rest is f
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray, IntArray
+from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery
 
 #: Error of a pulse, over a trigger cycle, up to which it is searched for.
@@ -33,21 +34,19 @@ _PARTS = 64  # of a cycle, in which errors hardly turn an order
 _JITTER, _BAD, _WON = 6.0, 8.0, 25.0
 
 
-def displacements(grid: FloatArray, recovery: PulseErrorRecovery, numbers: IntArray,
-                  begins: IntArray, *, cycle_length: float, period: float, first_angle: float,
-                  declared: float) -> FloatArray:
+def displacements(grid: FloatArray, recovery: PulseErrorRecovery, raw: Average, *,
+                  cycle_length: float, declared: float) -> FloatArray:
     """
     Return how late (pulse,) in s the displaced pulses are, 0 for all others.
 
-    `grid` (cycle, sample, channel) are trigger cycles between measured pulses, `numbers` (cycle,)
-    those since `first_angle`, `begins` (cycle,) the pulses at which they begin; `period` is their
-    mean in s, `declared` the standard deviation of the jitter in s.
+    `grid` (cycle, sample, channel) are the trigger cycles of the `raw` average between measured
+    pulses; `declared` is the standard deviation of the jitter in s.
     """
     found = np.zeros(recovery.expected.size)
     if len(grid) < _FEWEST or not recovery.orders.size:
         return found
-    fit = _Cycles(grid, recovery, numbers, cycle_length, first_angle)
-    to_cycles = cycle_length / period
+    fit = _Cycles(grid, recovery, raw, cycle_length)
+    begins, to_cycles = np.flatnonzero(raw.used), cycle_length / float(np.mean(raw.periods))
     errors = recovery.expected * to_cycles
     known = recovery.errors[recovery.resolved] * to_cycles
     usual = 1.4826 * float(np.median(np.abs(known))) if known.size else 0.0
@@ -86,8 +85,8 @@ def displacements(grid: FloatArray, recovery: PulseErrorRecovery, numbers: IntAr
 class _Cycles:
     """The amplitudes of trigger cycles between pulses with given errors, against their mean."""
 
-    def __init__(self, grid: FloatArray, recovery: PulseErrorRecovery, numbers: IntArray,
-                 cycle_length: float, first_angle: float) -> None:
+    def __init__(self, grid: FloatArray, recovery: PulseErrorRecovery, raw: Average,
+                 cycle_length: float) -> None:
         known = np.isfinite(recovery.noise) & np.isfinite(recovery.aligned)
         weight = np.where(known, recovery.noise, np.inf)**-2
         best = np.argsort(-np.sum(weight * np.abs(recovery.amplitudes)**2, axis=1))[:_CHANNELS]
@@ -106,7 +105,8 @@ class _Cycles:
         for number, order in enumerate(self._orders):
             carrier = 2.0 / samples * np.exp(-2j * np.pi * order * cycle_length * u)
             sums = np.add.reduceat(chosen * carrier[:, None], edges, axis=1)
-            start = np.exp(-2j * np.pi * order * (first_angle + cycle_length * numbers))
+            start = np.exp(-2j * np.pi * order * (
+                raw.first_angle + cycle_length * raw.cycle_numbers))
             self._parts[:, :, number] = (sums * start[:, None, None]).transpose(0, 2, 1)
 
     def misfit(self, cycles: IntArray, first: FloatArray, last: FloatArray) -> FloatArray:

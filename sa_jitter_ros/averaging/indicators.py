@@ -385,14 +385,12 @@ def condition_indicators(
     if samples.ndim not in (2, 3):
         raise SignalError(f'average of shape {samples.shape}: give channels x points, or '
                           'averages x channels x points')
-    settings = settings or GearSettings()
-    moments = _moments(samples if samples.ndim == 3 else samples[None], settings)
-    history = _History()
-    values = np.concatenate([history.take(moments.part(i))
-                             for i in range(len(moments.peak))])
-    if samples.ndim == 2:
-        values = values[0]
-    return ConditionIndicators(values, len(moments.peak), np.full(values.shape, np.nan))
+    running, values = RunningIndicators(settings), []
+    for item in _checked(samples).reshape(-1, *samples.shape[-2:]):
+        running.update(item)
+        values.append(running.get().values)
+    found = np.array(values) if samples.ndim == 3 else values[0]
+    return ConditionIndicators(found, len(values), np.full(found.shape, np.nan))
 
 
 class _Moments(NamedTuple):
@@ -416,10 +414,6 @@ class _Moments(NamedTuple):
     difference_8: Array
     envelope: Array
     envelope_4: Array
-
-    def part(self, index: int) -> '_Moments':
-        """Return those of one average."""
-        return _Moments(*(item[index:index + 1] for item in self))
 
     def levelled(self, counts: Array) -> '_Moments':
         """

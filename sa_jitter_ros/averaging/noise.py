@@ -54,10 +54,11 @@ def without_leakage(cycles: ComplexArray, orders: tuple[float, ...], length: flo
 
     Order 2 of amplitude 1 leaks into order 3, whose amplitude is 0, in cycles of r = 0.4:
 
-    >>> from sa_jitter_ros.averaging.cycle import project
     >>> angles = 0.4 * np.arange(50)
-    >>> wave = np.cos(4.0 * np.pi * np.linspace(0.0, 20.0, 5001))
-    >>> cycles = project(wave[:, None], 0.4, (2.0, 3.0), count=50)
+    >>> theta = angles[:, None] + 0.4 * (np.arange(100) + 0.5) / 100
+    >>> wave = 2.0 * np.cos(4.0 * np.pi * theta)
+    >>> cycles = np.stack([np.mean(wave * np.exp(-2j * np.pi * order * theta), axis=1)
+    ...                    for order in (2.0, 3.0)], axis=-1)[:, None]
     >>> float(abs(cycles[:, 0, 1]).max().round(2))
     0.76
     >>> float(abs(without_leakage(cycles, (2.0, 3.0), 0.4, angles)[:, 0, 1]).max().round(2))

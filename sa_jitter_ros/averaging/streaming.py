@@ -489,6 +489,7 @@ class StreamingAverager:
             if average is not None:
                 self._due.append((name, average))
             self.counts.averages_dropped += shaft.reset()
+        self._grids.forget()
 
     def _forget_used(self) -> None:
         """Drop the samples before the next cycle, and the pulses that the law needs no more."""
