@@ -56,8 +56,8 @@ def test_indicators_are_those_of_the_waveform():
 
 def test_they_are_made_when_asked_for_in_any_order_and_in_a_stream(monkeypatch):
     made = []
-    of = ShaftIndicators.of
-    monkeypatch.setattr(ShaftIndicators, 'of', lambda self, item: made.append(
+    of = ShaftIndicators.indicators_of
+    monkeypatch.setattr(ShaftIndicators, 'indicators_of', lambda self, item: made.append(
         item.sequence) or of(self, item))
     vibration, pulses = rig()
     options = {'ratio': 2.0, 'trigger_cycles': 40, 'mesh_orders': [19]}

@@ -253,22 +253,20 @@ def average(vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike,
             f'{counts["trigger_cycles"]} whole trigger cycles{of_average}: '
             + (likely or discarded or 'lower trigger_cycles, or give more pulses'))
     doubt = likely or other_rate(pulses, start, end, float(sample_rate))
-    if discarded:
-        warnings.warn(f'{doubt}; {discarded}' if doubt else discarded, DataWarning, stacklevel=2)
-    elif doubt:
-        warnings.warn(doubt, DataWarning, stacklevel=2)
-    elif values['target_geometry'] == 'none' and (lost := lost_inside_revolutions(
-            pulses, averager._stream.shafts[_SHAFT].settings,
-            values['pulses_per_revolution'], values['missing_teeth'])):
-        warnings.warn(lost, DataWarning, stacklevel=2)
-    if problem := averager.problem:
-        warnings.warn(f'no condition indicators: {problem}', DataWarning, stacklevel=2)
-    refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
+    lines = ['; '.join(filter(None, (doubt, discarded)))]
+    if not lines[0] and values['target_geometry'] == 'none':
+        lines[0] = lost_inside_revolutions(
+            pulses, averager._stream.shafts[_SHAFT].settings, values['pulses_per_revolution'],
+            values['missing_teeth'])
+    if averager.problem:
+        lines.append(f'no condition indicators: {averager.problem}')
+    lines.append(without_amplitude(max(found, key=lambda item: len(item.refused)).refused))
     envelopes = [item.envelope.problem for item in found if item.envelope is not None]
-    for line in filter(None, (refused, max(envelopes, default='', key=len))):
+    lines.append(max(envelopes, default='', key=len))
+    if values['orders'] is not None:
+        lines.append(without_lines(found))
+    for line in filter(None, lines):
         warnings.warn(line, DataWarning, stacklevel=2)
-    if values['orders'] is not None and (none := without_lines(found)):
-        warnings.warn(none, DataWarning, stacklevel=2)
     return found
 
 

@@ -18,7 +18,6 @@ frequency beyond half the sampling rate, and the samples decide more than the ke
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,51 +29,28 @@ from sa_jitter_ros.pulses.resampling import gain_below_nyquist
 LEAST_GAIN = 0.5
 
 
-@dataclass(frozen=True)
-class InterpolatorGain:
+def refused_orders(orders: Sequence[float], gains: FloatArray, *, method: str, rate: float,
+                   speed: float) -> dict[float, str]:
     """
-    Gains of an interpolation `method` at the frequencies of orders, for samples at `rate` (Hz).
+    Return which orders have no amplitude, and why.
 
-    >>> of = InterpolatorGain('band_limited', 1000.0)
-    >>> of.gains(np.array([[100.0, 376.0, 500.0]])).round(3)
-    array([[1.   , 0.986,   nan]])
+    `gains` (cycle, order) are those of all cycles, interpolated by `method` between samples at
+    `rate` (Hz); `speed` (Hz) is that of the shaft.
     """
+    return {float(order): _reason(float(left), method, rate, speed)
+            for order, left in zip(orders, gains.min(axis=0)) if not left >= LEAST_GAIN}
 
-    method: str
-    rate: float
 
-    def gains(self, frequency: FloatArray) -> FloatArray:
-        """Return the gains at frequencies (Hz), NaN from half the sampling rate on."""
-        return gain_below_nyquist(self.method, frequency / self.rate)
-
-    def refused(self, orders: Sequence[float], gains: FloatArray, speed: float
-                ) -> dict[float, str]:
-        """
-        Return which orders have no amplitude, and why.
-
-        `gains` (cycle, order) are those of all cycles, `speed` (Hz) is that of the shaft.
-        """
-        least = gains.min(axis=0)
-        if least.min() >= LEAST_GAIN:
-            return {}
-        return {float(order): self._reason(float(left), speed)
-                for order, left in zip(orders, least) if not left >= LEAST_GAIN}
-
-    def _reason(self, left: float, speed: float) -> str:
-        """Return why an order has no amplitude of which the interpolator leaves so much."""
-        share, why = 0.5, 'shows'
-        if not np.isnan(left):
-            share, why = self._half, f'interpolated {self.method} keeps half of'
-        return (f'the shaft turns at {speed:.5g} Hz, and vibration sampled at {self.rate:g} Hz '
-                f'{why} orders below {share * self.rate / speed:.5g} only; drop such orders, or '
-                'check ratio and sample_rate')
-
-    @property
-    def _half(self) -> float:
-        """Return the frequency, over the sampling rate, from which on less than half is left."""
-        frequency = np.linspace(0.0, 0.5, 1001)[:-1]
-        left = gain_below_nyquist(self.method, frequency)
-        return float(frequency[left >= LEAST_GAIN].max())
+def _reason(left: float, method: str, rate: float, speed: float) -> str:
+    """Return why an order has no amplitude of which the interpolator leaves so much."""
+    share, why = 0.5, 'shows'
+    if not np.isnan(left):
+        frequency = np.linspace(0.0, 0.5, 1001)[:-1]  # over the rate, up to where half is left
+        share = float(frequency[gain_below_nyquist(method, frequency) >= LEAST_GAIN].max())
+        why = f'interpolated {method} keeps half of'
+    return (f'the shaft turns at {speed:.5g} Hz, and vibration sampled at {rate:g} Hz {why} '
+            f'orders below {share * rate / speed:.5g} only; drop such orders, or check ratio and '
+            'sample_rate')
 
 
 def mean_gain(gains: FloatArray, orders: ArrayLike, refused: Mapping[float, str]) -> FloatArray:

@@ -20,7 +20,6 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.envelope import Envelope
-from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.shaft_indicators import best_of, ShaftIndicators
 
 AMPLITUDE_FIELDS = (
@@ -31,6 +30,8 @@ AMPLITUDE_FIELDS = (
 ENVELOPE_FIELDS = ('order', 'found_order', 'amplitude', 'standard_error', 'mean')
 SPECTRUM_FIELDS = ('order', 'amplitude')
 PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error', 'used')
+
+_Table = tuple[FloatArray, tuple[str, ...]]  # values and their fields
 
 
 @dataclass(frozen=True)
@@ -66,27 +67,11 @@ class AverageMessage:
     names: tuple[str, ...] = ()
 
 
-class ShaftResults:
-    """
-    The results of the averages of one shaft; condition indicators depend on earlier ones.
+class ShaftResults(ShaftIndicators):
+    """The results of the averages of one shaft; condition indicators depend on earlier ones."""
 
-    Jitter leaves other waveforms in averages whose correction was refused: these have a history of
-    their own.
-    """
-
-    def __init__(self, gear: GearSettings | None = None) -> None:
-        self._indicators = ShaftIndicators(gear)
-        #: Which bearing orders the latest average has no amplitude of, and why.
-        self.bearing_problem = ''
-
-    @property
-    def problem(self) -> str:
-        """Return why the latest average has no condition indicators."""
-        return self._indicators.problem
-
-    def use(self, gear: GearSettings) -> None:
-        """Use other mesh orders; the indicators forget earlier averages."""
-        self._indicators.use(gear)
+    #: Which bearing orders the latest average has no amplitude of, and why.
+    bearing_problem = ''
 
     def of(self, average: Average) -> dict[str, AverageMessage]:
         """
@@ -100,31 +85,28 @@ class ShaftResults:
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,
             average.fundamental_cycles, average.trigger_speed, average.discarded_cycles)
-        found = {
-            'synchronous_average': AverageMessage(header, average.waveform),
-            'standard_error': AverageMessage(header, average.standard_error),
-            'order_amplitude': AverageMessage(header, amplitude_table(average), AMPLITUDE_FIELDS)}
+        tables: dict[str, _Table] = {
+            'synchronous_average': (average.waveform, ()),
+            'standard_error': (average.standard_error, ()),
+            'order_amplitude': (amplitude_table(average), AMPLITUDE_FIELDS)}
         correction = average.correction
         if correction is not None and correction.accepted:
-            found['corrected_average'] = AverageMessage(header, correction.waveform)
-            found['pulse_error'] = AverageMessage(header, np.stack(
+            tables['corrected_average'] = correction.waveform, ()
+            tables['pulse_error'] = np.stack(
                 (average.pulses, correction.pulse_errors, correction.standard_errors,
-                 average.used), axis=1), PULSE_ERROR_FIELDS)
+                 average.used), axis=1), PULSE_ERROR_FIELDS
         envelope = average.envelope or best_of(average).envelope
         self.bearing_problem = envelope.problem if envelope is not None else ''
         if envelope is not None:
-            found |= {name: AverageMessage(header, *content)
-                      for name, content in envelope_tables(envelope).items()}
-        indicators = self._indicators.of(average)
+            tables |= envelope_tables(envelope)
+        indicators = self.indicators_of(average)
         if indicators is not None:
-            found['condition_indicator'] = AverageMessage(
-                header, indicators.values, indicators.names)
-            found['condition_indicator_error'] = AverageMessage(
-                header, indicators.standard_errors, indicators.names)
-        return found
+            tables['condition_indicator'] = indicators.values, indicators.names
+            tables['condition_indicator_error'] = indicators.standard_errors, indicators.names
+        return {name: AverageMessage(header, *table) for name, table in tables.items()}
 
 
-def envelope_tables(envelope: Envelope) -> dict[str, tuple[FloatArray, tuple[str, ...]]]:
+def envelope_tables(envelope: Envelope) -> dict[str, _Table]:
     """Return tables (channel, order, field) and their fields by the names of their topics."""
     shape = envelope.amplitudes.shape
     lines = np.stack((np.broadcast_to(envelope.bearing_orders, shape), envelope.found,

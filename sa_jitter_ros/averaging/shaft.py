@@ -30,7 +30,7 @@ from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
     has_same_angles, joined_cycles, needed_margin, waveform_cutoff, WaveformPoints)
-from sa_jitter_ros.averaging.interpolator_gain import InterpolatorGain, mean_gain
+from sa_jitter_ros.averaging.interpolator_gain import mean_gain, refused_orders
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.averaging.rows import Rows
@@ -38,6 +38,7 @@ from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, Pa
                                                   RunningMean, SlidingMean)
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law, LINEAR_LAW
+from sa_jitter_ros.pulses.resampling import gain_below_nyquist
 
 # Cycles from which on it is not known how many come.
 _ALL_CYCLES = 1 << 40
@@ -219,9 +220,9 @@ class ShaftAverager:
         count = cycles.count
         if not self._counted:
             self._expect_from(self._angle(self._cycle))
-        self._gain = InterpolatorGain(self.settings.interpolation, cycles.rate)
-        gains = self._gain.gains(np.multiply.outer(
-            self.settings.cycle_length / cycles.periods, self.settings.orders))
+        self._rate = cycles.rate
+        gains = gain_below_nyquist(self.settings.interpolation, np.multiply.outer(
+            self.settings.cycle_length / cycles.periods, self.settings.orders) / self._rate)
         amplitudes = self._resample(cycles) * (1.0 / gains)[:, None]
         # Real and imaginary parts have means of their own.
         self._amplitude_mean.update(np.ascontiguousarray(amplitudes).view(np.float64))
@@ -452,7 +453,8 @@ class ShaftAverager:
         cycles, gains = self._amplitudes.items, self._gains.items
         cycles.flags.writeable = False
         numbers, speed = self._places.items['number'], len(cycles) / seconds
-        refused = self._gain.refused(settings.orders, gains, settings.cycle_length * speed)
+        refused = refused_orders(settings.orders, gains, method=settings.interpolation,
+                                 rate=self._rate, speed=settings.cycle_length * speed)
         gain = mean_gain(gains, settings.orders, refused)
         amplitudes: ComplexArray = self._amplitude_mean.mean.view(np.complex128)
         if refused:

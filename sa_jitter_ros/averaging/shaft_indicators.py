@@ -52,7 +52,7 @@ class ShaftIndicators:
         if gear != self.gear:
             self.gear, self._running = gear, {}
 
-    def of(self, average: Average) -> ConditionIndicators | None:
+    def indicators_of(self, average: Average) -> ConditionIndicators | None:
         """
         Return the indicators of the next average.
 
@@ -81,7 +81,7 @@ class ShaftIndicators:
         with self._lock:
             while self._waiting and (last is None or last.waits):
                 item = self._waiting.popleft()
-                item.found, item.waits = self.of(item.average), False
+                item.found, item.waits = self.indicators_of(item.average), False
 
     def _has(self, best: Average | Correction) -> bool:
         """Return whether an average has indicators; where not, `problem` may say why."""
