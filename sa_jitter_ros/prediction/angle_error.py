@@ -196,6 +196,17 @@ def joint_characteristic(processes: Sequence[AngleErrorProcess], coefficients: S
     return product
 
 
+def pair_characteristic(processes: Sequence[AngleErrorProcess], orders: Array, u: Array, lag: int
+                        ) -> Array:
+    """
+    Return E x conj(y) and E x y of phasors x at places u of a cycle, y of the one `lag` behind.
+
+    They have the shape (2, order, place of x, place of y).
+    """
+    plane, signs = orders[:, None, None], np.array([-1.0, 1.0])[:, None, None, None]
+    return joint_characteristic(processes, [plane, signs * plane], [u[:, None], u], [0, lag])
+
+
 def angle_spread(processes: Sequence[AngleErrorProcess]) -> float:
     """Return the standard deviation of the angle errors in fundamental cycles, roughly."""
     variance = 0.0

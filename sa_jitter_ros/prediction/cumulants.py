@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array, BoolArray
 from sa_jitter_ros.prediction.angle_error import (
-    AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
+    AngleErrorProcess, IndependentPulseJitter, joint_characteristic, pair_characteristic,
+    unit_nodes)
 from sa_jitter_ros.prediction.distributions import Empirical
 from sa_jitter_ros.prediction.moments import (
-    correlation_length, cycle_moments, CycleMoments, require_cycles, require_orders)
+    correlation_length, cycle_moments, CycleMoments)
 
 _REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
@@ -45,8 +46,7 @@ def third_cumulants(orders: ArrayLike, processes: Sequence[AngleErrorProcess], t
 
     `cycles` are the `cycle_moments` of the same processes.
     """
-    g = require_orders(orders)
-    require_cycles(trigger_cycles)
+    g = np.asarray(orders, float)
     u, w = unit_nodes(nodes)
     length = correlation_length(processes)
     axes = (u[:, None, None], u[:, None], u)
@@ -92,7 +92,6 @@ def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int, clear: BoolA
     for phasors of a Gaussian phase, and cheap where the memory is long. Long averages are summed
     in blocks. 0 where the mean of a cycle is not `clear` (order,) enough to expand about.
     """
-    require_cycles(trigger_cycles)
     size = np.abs(cycles.mean)
     m, size = np.where(clear, cycles.mean, 1.0), np.where(clear, size, 1.0)
     block = math.ceil(trigger_cycles / _MOST_BLOCKS)
@@ -132,7 +131,7 @@ def _superposed(orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigg
     reach = int(np.flatnonzero(np.any(known >= _FORGOTTEN * known[0], axis=1))[-1])
     if (2 * reach + 1) * _INSIDE > _MOST_INSIDE:
         return superposed_cumulants(cycles, trigger_cycles, clear)
-    g = require_orders(orders)
+    g = np.asarray(orders, float)
     u, w = unit_nodes(_INSIDE)
     mean = np.where(clear[:, None], joint_characteristic(
         processes, [g[:, None]], [u], [0]), 1.0)
@@ -165,15 +164,13 @@ def _pairs(g: Array, processes: Sequence[AngleErrorProcess], mean: Array, u: Arr
     They are (order, lag, place of x, place of y), 0 for lags beyond `reach`.
     """
     found = np.zeros((2, g.size, 4 * reach + 1, u.size, u.size), complex)
-    order, signs = g[:, None, None], np.array([1.0, -1.0])[:, None, None, None]
-    level = mean[:, :, None] * np.stack((mean, mean.conj()))[:, :, None]
+    level = mean[:, :, None] * np.stack((mean.conj(), mean))[:, :, None]
     for lag in range(reach + 1):
-        value = joint_characteristic(
-            processes, [order, signs * order], [u[:, None], u], [0, lag]) / level - 1.0
+        value = pair_characteristic(processes, g, u, lag) / level - 1.0
         back = value.swapaxes(2, 3)
-        found[:, :, 2 * reach - lag] = np.stack((back[0], back[1].conj()))
+        found[:, :, 2 * reach - lag] = np.stack((back[0].conj(), back[1]))
         found[:, :, 2 * reach + lag] = value
-    return found[0], found[1]
+    return found[1], found[0]
 
 
 def average_cumulants(orders: ArrayLike, processes: Sequence[AngleErrorProcess],

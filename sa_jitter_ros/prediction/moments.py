@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import (
-    angle_spread, AngleErrorProcess, joint_characteristic, unit_nodes)
+    angle_spread, AngleErrorProcess, joint_characteristic, pair_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import is_number
 
 NODES = 64
@@ -127,7 +127,6 @@ def cycle_moments(orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, 
                  for some in np.array_split(g, range(_TOGETHER, g.size, _TOGETHER))]
         return CycleMoments(*(np.concatenate(item, axis=-1) for item in zip(*found)))
     u, w = unit_nodes(nodes)
-    plane, signs = g[:, None, None], np.array([-1.0, 1.0])[:, None, None, None]
     mean = joint_characteristic(processes, [g[:, None]], [u], [0]) @ w
     pairs = []
     fine = (u, w, mean)
@@ -136,7 +135,7 @@ def cycle_moments(orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, 
     length = correlation_length(processes)
     for lag in range((length if lags is None else min(lags, length)) + 1):
         u, w, level = fine if lag <= _NEAR else far
-        both = joint_characteristic(processes, [plane, signs * plane], [u[:, None], u], [0, lag])
+        both = pair_characteristic(processes, g, u, lag)
         pairs.append(both @ w @ w - np.stack((np.abs(level) ** 2, level**2)))
     variance, pseudo = np.moveaxis(np.array(pairs), 1, 0)
     spread = g * angle_spread(processes)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import (
-    AngleErrorProcess, joint_characteristic, unit_nodes)
+    AngleErrorProcess, joint_characteristic, pair_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
 
@@ -44,7 +44,8 @@ def scenario_moments(model: DeclaredModel, processes: Sequence[AngleErrorProcess
     first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
     count = model.trigger_cycles
     reach = min(correlation_length(processes) + 1, count) if processes else 0
-    joint = [_joint(processes, g, u, first, lag) for lag in range(reach)]
+    alone = first[:, :, None] * np.stack((first.conj(), first))[:, :, None]
+    joint = [pair_characteristic(processes, g, u, lag) - alone for lag in range(reach)]
     shape = (len(cycles), g.size)
     mean, variance, pseudo = (np.zeros(shape, complex) for _ in range(3))
     rows = max(1, _BLOCK // (u.size * (min(count, _BLOCK // u.size) + reach)))
@@ -68,16 +69,6 @@ def scenario_moments(model: DeclaredModel, processes: Sequence[AngleErrorProcess
                         'suv,uv->s', early @ late.conj(), pairs[0][i])
                     pseudo[part, i] += scale * np.einsum('suv,uv->s', early @ late, pairs[1][i])
     return AverageMoments(mean, np.maximum(variance.real, 0.0), pseudo)
-
-
-def _joint(processes: Sequence[AngleErrorProcess], g: Array, u: Array, first: Array, lag: int
-           ) -> tuple[Array, Array]:
-    """Return the covariances (order, u, v) of phasors `lag` apart, second conjugate or not."""
-    plane, points = g[:, None, None], ([u[:, None], u], [0, lag])
-    alone = first[:, :, None]
-    return (joint_characteristic(processes, [plane, -plane], *points)
-            - alone * first[:, None, :].conj(),
-            joint_characteristic(processes, [plane, plane], *points) - alone * first[:, None, :])
 
 
 def _phasors(model: DeclaredModel, order: float, pulses: Array, path: Array) -> Array:
