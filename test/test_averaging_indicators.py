@@ -380,7 +380,7 @@ class TestStandardErrors:
     @pytest.mark.parametrize('cycles', [7, 40, 1 << 60])
     def test_an_average_has_parts_of_its_cycles(self, rng, cycles):
         """Their mean is that of all; without a number of cycles they are of any size."""
-        settings = AverageSettings(keep_parts=True, trigger_cycles=cycles)
+        settings = AverageSettings(trigger_cycles=cycles)
         averager = StreamingAverager(
             {'shaft': settings}, validator=PulseValidator(), keep_unfinished=True,
             timeline=VibrationTimeline(buffer_seconds=100.0))

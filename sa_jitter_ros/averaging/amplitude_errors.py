@@ -33,7 +33,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import ComplexArray, FloatArray
-from sa_jitter_ros.averaging.noise import row_medians
+from sa_jitter_ros.averaging.noise import row_medians, scatter_power
 from scipy import fft
 from scipy.special import chndtrix, erf
 
@@ -226,13 +226,6 @@ class Scatter:
         return np.hypot(widened(np.sqrt(self.noise / len(self.radial)), self.freedom), self.leaked)
 
 
-def _spectrum(series: FloatArray) -> FloatArray:
-    """Return the power of real series (cycle, ...) without frequency zero and Nyquist's."""
-    count = len(series)
-    lines = np.fft.rfft(series, axis=0)[1:(count - 1) // 2 + 1]
-    return np.asarray((lines.real**2 + lines.imag**2) / count)
-
-
 def _white(series: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """
     Return the variance of white noise in `series` (cycle, ...), its freedom, and that of tones.
@@ -244,7 +237,7 @@ def _white(series: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     if lines < _ROBUST_FROM:
         variance = np.sum(series**2, axis=0) / (count - 1)
         return variance, np.full(variance.shape, count - 1.0), np.zeros(variance.shape)
-    power = _spectrum(series)
+    power = scatter_power(series)
     floor = row_medians(power.reshape(lines, -1).T).reshape(power.shape[1:]) / np.log(2.0)
     for _ in range(3):
         noise = power <= _OUTLIER * floor
@@ -313,7 +306,7 @@ class Repeatability:
         across = _together(noise / count, freedom, across, known)
         if count >= _MANY:
             lines = max(_LINES, round(_SHARE * count))
-            near_zero = _spectrum(scatter.tangential)[:lines].mean(axis=0)
+            near_zero = scatter_power(scatter.tangential)[:lines].mean(axis=0)
             across = np.where(shows, widened(np.sqrt(near_zero / count), 2.0 * lines), across)
         return cls(orders, np.hypot(along, scatter.leaked), np.hypot(across, scatter.leaked),
                    math.sqrt(variance))
@@ -507,7 +500,7 @@ class _Jittered:
         axis = np.where(self.shows, radius, np.exp(0.5j * np.angle(self.lean[0])))
         series = (scatter.radial + 1j * scatter.tangential) * np.where(
             self.shows, 1.0, radius * np.conj(axis))
-        power = np.concatenate((_spectrum(series.real), _spectrum(series.imag)))
+        power = np.concatenate((scatter_power(series.real), scatter_power(series.imag)))
         lines = len(power) // 2
         cosine = 2.0 * np.cos(2.0 * pi * np.arange(1, lines + 1) / count)[:, None, None]
         expected = np.concatenate([

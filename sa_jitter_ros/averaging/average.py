@@ -43,10 +43,9 @@ class AverageSettings:
     `correct_jitter` the pulse errors are recovered from the vibration (block averages only). They
     are expected to be of the size that a keyphasor sampled at `keyphasor_rate` (Hz) causes; 0 is
     the sampling rate of the vibration. Up to `maximum_discarded` times N_t discarded trigger
-    cycles may lie between those of an average, if their number is known. With `keep_parts` a block
-    average has the waveforms of parts of its cycles, too, with bearing orders in `envelope` the
-    squared envelope of the residual signal. Raises `ParameterError` for values that cannot be
-    used.
+    cycles may lie between those of an average, if their number is known. With bearing orders in
+    `envelope` a block average has the squared envelope of the residual signal. Raises
+    `ParameterError` for values that cannot be used.
     """
 
     cycle_length: float = 1.0
@@ -60,7 +59,6 @@ class AverageSettings:
     correct_jitter: bool = False
     keyphasor_rate: float = 0.0
     maximum_discarded: float = 0.0
-    keep_parts: bool = False
     envelope: EnvelopeSettings = field(default_factory=EnvelopeSettings)
 
     def __post_init__(self) -> None:
@@ -199,7 +197,7 @@ class Correction:
     Both contain the same noise, and `attenuation_standard_error` accounts for this correlation.
     `cycle_amplitudes` (cycle, channel, order) are those of the single trigger cycles between
     corrected pulses. `amplitude_errors` say how far `amplitudes` are from the truth, `parts` are
-    the waveforms of parts of the cycles, None unless `keep_parts` was set, `envelope` that of the
+    the waveforms of parts of the cycles, None of fewer than three, `envelope` that of the
     residual signal between corrected pulses, None without bearing orders.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
@@ -279,8 +277,8 @@ class Average:
     `cycle_amplitudes` (cycle, channel, order)
     are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
     angle as those of their mean. `amplitude_errors` say how well another average would repeat
-    `amplitudes`. `parts` are the waveforms of parts of the cycles, None unless `keep_parts` was
-    set. `correction` is None unless `correct_jitter` was set.
+    `amplitudes`. `parts` are the waveforms of parts of the cycles of a block, None of fewer than
+    three whole fundamental cycles. `correction` is None unless `correct_jitter` was set.
 
     `indicators`, `residual` and `difference` are made when they are first asked for
     (`sa_jitter_ros.averaging.indicators`); `envelope` is that of what the average leaves of the

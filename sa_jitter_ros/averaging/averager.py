@@ -112,7 +112,7 @@ class Averager:
         envelope = EnvelopeSettings(numbers('bearing_orders', values.pop('bearing_orders')),
                                     numbers('envelope_band', values.pop('envelope_band')))
         self._stream = StreamingAverager(
-            {_SHAFT: keyphasor.average(envelope=envelope, keep_parts=True, **values)},
+            {_SHAFT: keyphasor.average(envelope=envelope, **values)},
             validator=keyphasor.validator(), timeline=VibrationTimeline(
                 time_tolerance=keyphasor.time_tolerance, buffer_seconds=buffer_seconds),
             keep_unfinished=endless)

@@ -104,7 +104,7 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
     try:
         return keyphasor_parameters(values).average(
             ratio=ratio, orders=values[f'{name}.orders'],
-            samples_per_revolution=values[f'{name}.samples_per_revolution'], keep_parts=True,
+            samples_per_revolution=values[f'{name}.samples_per_revolution'],
             envelope=EnvelopeSettings(tuple(values[f'{name}.bearing_orders']),
                                       tuple(values[f'{name}.envelope_band'])),
             **{key: values[key] for key in (

@@ -34,7 +34,7 @@ from sa_jitter_ros.arrays import ComplexArray, FloatArray, IntArray
 from sa_jitter_ros.inner_loops import add_products
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_lines, run_times
 from sa_jitter_ros.pulses.resampling import (
-    impulse_response, interpolate_along, interpolate_between, margin)
+    impulse_response, interpolate_along, interpolate_between)
 from scipy.fft import next_fast_len
 
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
@@ -288,12 +288,6 @@ def waveform_cutoff(points: int, cycles: float, periods: FloatArray | float, rat
     """Return the band of a waveform of so many `points`, as a fraction of that of the samples."""
     cutoff = points * cycles / (np.asarray(periods) * rate)
     return np.where(cutoff < 1.0, np.exp2(np.floor(16.0 * np.log2(cutoff)) / 16.0), 1.0)
-
-
-@lru_cache(maxsize=64)
-def needed_margin(method: str, cutoff: float) -> int:
-    """Return how many samples are needed on either side of a cycle."""
-    return max(margin(method), margin(method, cutoff=cutoff)) + 1
 
 
 @lru_cache(maxsize=16)

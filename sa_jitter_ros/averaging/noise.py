@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import ComplexArray, FloatArray
+from scipy.special import digamma
 
 # The orders that leak contain leakage of each other: iterations until this is negligible.
 _PASSES = 6
@@ -131,17 +132,20 @@ def radial_noise(cycles: ComplexArray) -> FloatArray:
     if count < 2:
         return np.full(cycles.shape[1:], np.nan)
     radial = (cycles * np.exp(-1j * np.angle(cycles.mean(axis=0)))).real
-    lines = (count - 1) // 2
+    power = scatter_power(radial)
+    lines = len(power)
     if lines < _MEDIAN_FROM:
         return np.asarray(np.sqrt(radial.var(axis=0, ddof=1) / count))
-    power = np.abs(np.fft.rfft(radial, axis=0)[1:lines + 1]) ** 2 / count
     # expected median of `lines` exponential variables of unit mean
-    if lines % 2:
-        factor = float(np.sum(1.0 / np.arange((lines + 1) // 2, lines + 1)))
-    else:
-        upper = 1.0 / np.arange(lines // 2 + 1, lines + 1)
-        factor = float(np.sum(upper) + 1.0 / lines)
+    factor = digamma(lines + 1.0) - digamma(lines // 2 + 1.0) + (1.0 - lines % 2) / lines
     return np.asarray(np.sqrt(np.median(power, axis=0) / factor / count))
+
+
+def scatter_power(series: FloatArray) -> FloatArray:
+    """Return the power of real series (cycle, ...) without frequency zero and Nyquist's."""
+    count = len(series)
+    lines = np.fft.rfft(series, axis=0)[1:(count - 1) // 2 + 1]
+    return np.asarray((lines.real**2 + lines.imag**2) / count)
 
 
 def noise_floor(grid: FloatArray, cycles: float, orders: FloatArray, top: float) -> FloatArray:

@@ -29,7 +29,7 @@ from sa_jitter_ros.averaging.amplitude_errors import Repeatability, waveform_err
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
-    has_same_angles, joined_cycles, needed_margin, waveform_cutoff, WaveformPoints)
+    has_same_angles, joined_cycles, waveform_cutoff, WaveformPoints)
 from sa_jitter_ros.averaging.interpolator_gain import mean_gain, refused_orders
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
@@ -38,7 +38,7 @@ from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, Pa
                                                   RunningMean, SlidingMean)
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law, LINEAR_LAW
-from sa_jitter_ros.pulses.resampling import gain_below_nyquist
+from sa_jitter_ros.pulses.resampling import gain_below_nyquist, margin
 
 # Cycles from which on it is not known how many come.
 _ALL_CYCLES = 1 << 40
@@ -145,7 +145,8 @@ class ShaftAverager:
         if points * self.settings.cycle_length < period * rate:
             cutoff = float(waveform_cutoff(points, self.settings.cycle_length, period, rate))
         edge = EDGE if self._needs_edges(points) and cutoff == 1.0 else 0
-        return needed_margin(self.settings.interpolation, cutoff) + edge
+        method = self.settings.interpolation
+        return max(margin(method), margin(method, cutoff=cutoff)) + 1 + edge
 
     def update(self, cycles: CycleSamples) -> Average | None:
         """
@@ -379,7 +380,7 @@ class ShaftAverager:
     def _new_wave_mean(self) -> RunningMean:
         settings = self.settings
         cycles = max(settings.trigger_cycles * settings.cycle_length, 1.0)
-        if not settings.keep_parts or settings.averaging != 'block':
+        if settings.averaging != 'block':
             return self._new_mean(cycles)
         size = max(int(cycles / PARTS), 1) if cycles < _ALL_CYCLES else 1
         return PartsMean(size=size, least=PARTS)
