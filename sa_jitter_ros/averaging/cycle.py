@@ -57,12 +57,12 @@ class CycleSamples:
     """
     The samples of consecutive trigger cycles, and those on either side that interpolation needs.
 
-    `samples` (sample, channel) at `rate` (Hz); the first is `lead` s after `start_time` (s). These
-    are two numbers because their sum rounds by 0.1 us where times count from 1970. `pulses` (s)
-    are those that the angle law uses; the `count` cycles begin at `pulses[first]`. With a speed
-    ripple inside the cycles the shaft passes the fraction u of one by `ripple` u (1 - u) s earlier
-    than the angle law says; `ripple` is that of all cycles or (cycle,). The channels `lacking`
-    (cycle,) samples in or beside a cycle have 0 in their place; empty if there are none.
+    `samples` (sample, channel) at `rate` (Hz); the first is `first_index` samples after
+    `start_time` (s). Their sum in s would round by 0.1 us where times count from 1970. `pulses`
+    (s) are those that the angle law uses; the `count` cycles begin at `pulses[first]`. With a
+    speed ripple inside the cycles the shaft passes the fraction u of one by `ripple` u (1 - u) s
+    earlier than the angle law says; `ripple` is that of all cycles or (cycle,). The channels
+    `lacking` (cycle,) samples in or beside a cycle have 0 in their place; empty if there are none.
     """
 
     samples: FloatArray
@@ -70,7 +70,7 @@ class CycleSamples:
     rate: float
     pulses: FloatArray
     first: int
-    lead: float = 0.0
+    first_index: int = 0
     ripple: float | FloatArray = 0.0
     count: int = 1
     lacking: tuple[tuple[int, ...], ...] = ()
@@ -89,7 +89,7 @@ class CycleSamples:
                      for i in (first, first + count))
         begin = max(math.floor(low) - margin, 0)
         return cls(samples[begin:math.ceil(high) + margin + 1], start_time, rate, pulses, first,
-                   lead=(offset + begin) / rate, ripple=ripple, count=count)
+                   first_index=offset + begin, ripple=ripple, count=count)
 
     def without_gaps(self) -> 'CycleSamples':
         """Return the same cycles with 0 for NaN."""
@@ -163,11 +163,6 @@ class CycleSamples:
         return np.asarray(interpolate_between(
             self.samples, np.array([index + origin - self.first_index], np.int32),
             np.array([pulse - origin - index]), method=method)[0])
-
-    @property
-    def first_index(self) -> int:
-        """Return the samples from `start_time` to the first one."""
-        return round(self.lead * self.rate)
 
 
 def joined_cycles(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
