@@ -20,7 +20,7 @@ import sa_jitter_ros as sa
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses import detection
 from sa_jitter_ros.pulses.detection import KeyphasorDetector
-from sa_jitter_ros.pulses.threshold import state_levels
+from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels
 from scipy.signal import butter, lfilter
 
 RATE = 10_000.0
@@ -638,3 +638,13 @@ def test_long_windows_are_looked_at_in_part(rng, monkeypatch):
         detector.update(0.01 * rng.standard_normal(200_000), float(start), 200e3)
     assert len(sizes) > 20
     assert max(sizes) <= 1 << 17
+
+
+def test_the_time_of_an_edge_does_not_depend_on_other_edges_of_its_block():
+    sudden, slow = np.array([0.0, 0.3, 0.4, 0.45, 1.0]), np.array([1.0, 0.7, 0.6, 0.4, 0.3, 0.0])
+    options = {'threshold': 0.5, 'band': 0.3, 'near': 0.9}
+    together, _ = SchmittTrigger(interpolate=True).update(
+        np.append(sudden, slow), 0, **options)
+    alone = SchmittTrigger(interpolate=True)
+    apart = [alone.update(part, index, **options)[0] for part, index in ((sudden, 0), (slow, 5))]
+    assert together == pytest.approx(np.concatenate(apart), abs=1e-12)

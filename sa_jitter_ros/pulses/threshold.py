@@ -450,7 +450,7 @@ def _before(signal: FloatArray, threshold: float, near: float, begin: IntArray, 
         slope = 12.0 * moment / (count * (count**2 - 1.0))
         slope = np.where(np.abs(slope) > near / _LONGEST, slope, near / _LONGEST)
         found = np.clip(0.5 * (low + high) - mean / slope, lowest, highest)
-        if count.max() == 2:  # steep edges
+        if not (near and np.any(highest - lowest > 1)):  # steep edges, here and in any other cut
             break
         reach = np.minimum(near / np.abs(slope), highest - lowest)
         low = np.clip(np.ceil(found - reach).astype(np.int64), lowest, -1)
