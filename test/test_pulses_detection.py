@@ -130,7 +130,7 @@ def test_a_stopped_machine_gives_no_pulses(noise, rng):
             'bit': rng.integers(0, 2, n), 'constant': np.full(n, 0.7)}[noise]
     pulses, detector = detect(wave)
     assert pulses.size == 0
-    assert detector.state.windows_without_levels >= 19
+    assert np.isnan(detector.state.threshold)
 
 
 def test_stop_and_start_again(rng):
@@ -170,7 +170,6 @@ def test_a_gap_invents_no_pulse():
     detector = KeyphasorDetector(edge='centre')
     first = detector.update(wave[:10_000 - 8100 + 6000], 0.0, RATE)
     second = detector.update(wave[inside:], inside / RATE, RATE)
-    assert detector.state.gaps == 1
     known = TRUE[(TRUE < 0.78) | (np.arange(TRUE.size) > 20)]
     assert np.concatenate([first, second]) == pytest.approx(known + 1e-3, abs=1e-7)
 
@@ -186,7 +185,6 @@ def test_a_refused_block_is_a_gap_and_no_pulse():
         detector.update(bad, start / RATE, RATE)
     last = detector.update(wave[end:], end / RATE, RATE)
     assert np.concatenate([first, last]) == pytest.approx(np.delete(TRUE, [21, 22]), abs=1e-7)
-    assert detector.state.gaps == 1
 
 
 def test_time_running_back_starts_again():
@@ -194,9 +192,7 @@ def test_time_running_back_starts_again():
     detector = KeyphasorDetector()
     detector.update(wave, 50.0, RATE)
     assert detector.update(wave, 0.0, RATE) == pytest.approx(TRUE, abs=1e-7)
-    assert detector.state.gaps == 1
     detector.reset()
-    assert detector.state.pulses == 0
     assert np.isnan(detector.state.threshold)
 
 
@@ -213,7 +209,7 @@ def test_bad_blocks_are_refused(samples, start, rate, message):
     detector.update(np.zeros(10), 0.0, RATE)
     with pytest.raises(SignalError, match=message):
         detector.update(samples, start, rate)
-    assert detector.state.samples == 10
+    assert detector.state.waiting == 10
 
 
 @pytest.mark.parametrize('options', [
@@ -230,8 +226,7 @@ def test_bad_options_are_refused(options):
 def test_motor_tacho(shared_data, name, speed, jitter):
     with np.load(shared_data / f'{name}.npz') as data:
         tach, rate = data['tach'], float(data['tach_rate'])
-    pulses, detector = detect(tach, rate=rate)
-    assert detector.state.pulses == pulses.size
+    pulses, _ = detect(tach, rate=rate)
     revolutions = pulses[::8]
     assert 1.0 / np.diff(revolutions).mean() == pytest.approx(speed, rel=5e-3)
     assert np.std(np.diff(revolutions, 2)) / np.sqrt(6.0) < jitter

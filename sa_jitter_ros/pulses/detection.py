@@ -33,9 +33,6 @@ from sa_jitter_ros.pulses.threshold import (
     SchmittTrigger, state_levels, StateLevels, whole_pulses)
 from sa_jitter_ros.samples import SampleBlock
 
-__all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'detector_of',
-           'pulses_in_blocks', 'spikes_text']
-
 Polarity = Literal['positive', 'negative', 'auto']
 Edge = Literal['rising', 'falling', 'centre']
 _NONE: FloatArray = np.empty(0)
@@ -66,21 +63,16 @@ class KeyphasorState:
     State levels and counts of a detector; levels in the waveform's unit, NaN if unknown.
 
     `waiting` counts samples that are searched for pulses when the levels are known; `too_close`
-    pulses dropped because of `minimum_interval`, `gaps` interruptions of the sample times and
-    `windows_without_levels` learning windows in which the waveform did not have two levels.
-    `spikes` counts the samples far beyond the levels that were bridged. `polarity` is that of the
-    pulses: positive or negative, auto as long as it is not decided.
+    pulses dropped because of `minimum_interval`; `spikes` the samples far beyond the levels that
+    were bridged. `polarity` is that of the pulses: positive or negative, auto as long as it is not
+    decided.
     """
 
     low: float
     high: float
     threshold: float
-    samples: int
     waiting: int
-    pulses: int
     too_close: int
-    gaps: int
-    windows_without_levels: int
     spikes: int
     polarity: str
 
@@ -117,8 +109,8 @@ class KeyphasorDetector:
     >>> tach = np.tile([0.0, 0.0, 5.0, 5.0, 0.0], 3)
     >>> detector.update(tach[:7], 0.0, 100.0), detector.update(tach[7:], 0.07, 100.0)
     (array([0.015]), array([0.065, 0.115]))
-    >>> detector.state.pulses
-    3
+    >>> detector.state.threshold
+    2.5
     """
 
     def __init__(
@@ -154,8 +146,7 @@ class KeyphasorDetector:
         self._trigger_origin = np.nan
         self._leading: float | None = None
         self._last_pulse = -np.inf
-        self._samples = self._pulses = self._too_close = self._gaps = self._levelless = 0
-        self._spikes = 0
+        self._too_close = self._spikes = 0
 
     @property
     def state(self) -> KeyphasorState:
@@ -165,9 +156,8 @@ class KeyphasorDetector:
         waiting = 0 if self._levels else self._held
         return KeyphasorState(
             low=low, high=high, threshold=self._sign * self._threshold(levels),
-            samples=self._samples, waiting=waiting, pulses=self._pulses,
-            too_close=self._too_close, gaps=self._gaps, windows_without_levels=self._levelless,
-            spikes=self._spikes, polarity='auto' if not self._decided else (
+            waiting=waiting, too_close=self._too_close, spikes=self._spikes,
+            polarity='auto' if not self._decided else (
                 'positive' if self._sign > 0.0 else 'negative'))
 
     def update(self, samples: npt.ArrayLike, start_time: float, sample_rate: float) -> FloatArray:
@@ -183,9 +173,7 @@ class KeyphasorDetector:
         self._rate, self._shortest = sample_rate, max(
             round(self._learning_time * sample_rate), _FEWEST)
         if not abs(start_time - (self._origin + self._index / sample_rate)) <= 0.5 / sample_rate:
-            self._gaps += bool(np.isfinite(self._origin))
             self._origin, self._index = start_time, 0
-        self._samples += block.size
         found = []
         window = self._shortest if self._learns else max(block.size, 1)
         while block.size:
@@ -237,7 +225,6 @@ class KeyphasorDetector:
         while self._held and not self._held % size and size <= most:
             size *= 2
             found = self._learn(size // 2, whole=bool(self._levels) or size <= most)
-        self._levelless += bool(self._held)
         if size > most:
             self._held //= 2
             self._window = _last(self._window, self._held)
@@ -326,9 +313,7 @@ class KeyphasorDetector:
             crossings = self._centres(crossings, rising)
         else:
             crossings = crossings[rising == (self._edge == 'rising')]
-        pulses = self._apart(origin + crossings / self._rate)
-        self._pulses += pulses.size
-        return pulses
+        return self._apart(origin + crossings / self._rate)
 
     def _band(self, levels: StateLevels, *, steep: bool) -> float:
         """Return half of the hysteresis: 0 if it is, but between lobes."""

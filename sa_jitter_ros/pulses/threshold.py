@@ -27,9 +27,6 @@ import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ['SchmittTrigger', 'StateLevels', 'state_levels', 'whole_pulses']
-
-
 _BINS = 100
 # Difference of the means of both halves over the noise, which follows from the steps between
 # samples. It is 1.6 (normal), 1.7 (uniform) or 2 (one bit) for white noise, but sqrt(n) for a
