@@ -64,9 +64,9 @@ def find_clock(times: Array) -> Clock:
     gaps = np.diff(intervals[intervals < 1.5 * np.median(intervals)])
     least = rounding(times)
     grid = find_grid(times, least, max(_LEAST_GAP * float(np.max(gaps, initial=0.0)), least))
-    if grid is None or np.count_nonzero(gaps <= _SAME * grid.tick) < 0.5 * gaps.size:
+    if grid is None or np.count_nonzero(gaps <= _SAME / grid[0]) < 0.5 * gaps.size:
         return NO_CLOCK
-    return Clock(1.0 / grid.tick, grid.standard_error / grid.tick**2)
+    return Clock(*grid)
 
 
 def rounding(times: Array) -> float:

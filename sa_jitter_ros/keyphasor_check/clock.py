@@ -35,11 +35,11 @@ def find_clock(times: FloatArray, *, largest: float = 0.0) -> Clock:
         return NO_CLOCK
     rounding = 4.0 * float(np.spacing(max(np.max(np.abs(times)), largest)))
     grid = find_grid(times, rounding)
-    if grid is not None and is_decimal(1.0 / grid.tick):  # a coarser one may be behind it
-        grid = find_grid(times, rounding, 2.0 * grid.tick) or grid
-    if grid is None or grid.tick < rounding:  # the last digit of the times themselves
+    if grid is not None and is_decimal(grid[0]):  # a coarser one may be behind it
+        grid = find_grid(times, rounding, 2.0 / grid[0]) or grid
+    if grid is None or rounding * grid[0] > 1.0:  # the last digit of the times themselves
         return NO_CLOCK
-    return Clock(1.0 / grid.tick, grid.standard_error / grid.tick**2)
+    return Clock(*grid)
 
 
 def is_decimal(rate: float) -> bool:

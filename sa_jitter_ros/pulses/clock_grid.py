@@ -16,8 +16,6 @@ multiples of its tick. At a changing speed intervals still differ by multiples o
 ticks those that are nearly equal, from which it follows step by step over longer and longer times.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 
@@ -62,23 +60,17 @@ def clock_tick(intervals: FloatArray, latest: float) -> float:
     return 0.0
 
 
-@dataclass(frozen=True)
-class Grid:
-    """A grid on which pulse times lie: its `tick` in s, with the standard error of that."""
-
-    tick: float
-    standard_error: float
-
-
-def find_grid(times: FloatArray, rounding: float, least: float = 0.0) -> Grid | None:
+def find_grid(times: FloatArray, rounding: float, least: float = 0.0
+              ) -> tuple[float, float] | None:
     """
-    Return the coarsest grid of which all `times` (n,) in s, ascending, are points; None for none.
+    Return the rate (Hz) of the coarsest grid of which all `times` (n,) are points; None for none.
 
-    `rounding` (s) is that of the difference of two intervals; differences of intervals up to
-    `least` (s) are none.
+    The second result is its standard error. The times are in s and ascend; `rounding` (s)
+    is that of the difference of two intervals; differences of intervals up to `least` (s) are
+    none.
 
     >>> times = np.ceil(np.linspace(1.0, 3.0, 200) ** 2 * 51200.0) / 51200.0
-    >>> round(1.0 / find_grid(times, 1e-14).tick, 3)
+    >>> round(find_grid(times, 1e-14)[0], 3)
     51200.0
     """
     least = max(least, 2.0 * rounding)
@@ -111,7 +103,7 @@ def find_grid(times: FloatArray, rounding: float, least: float = 0.0) -> Grid | 
             tick > np.quantile(intervals, 0.1) / _LEAST_TICKS):
         return None
     # Rounding is no chance: it need not average out over the pulses.
-    return Grid(tick, float(np.hypot(scatter / np.sqrt(power), rounding / ticks[-1])))
+    return 1.0 / tick, float(np.hypot(scatter / np.sqrt(power), rounding / ticks[-1])) / tick**2
 
 
 def _refined(lengths: FloatArray, tick: float) -> float:
