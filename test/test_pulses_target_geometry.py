@@ -324,7 +324,7 @@ def test_a_gap_among_the_first_revolutions_costs_no_later_pulse(rng, first):
 def test_given_angles_are_found_in_far_fewer_revolutions_than_unknown_ones_are_learnt():
     late = np.array([0.02, 0.0, -0.02])  # rad, at 100 Hz
     waited = []
-    for given in (late.tolist(), None):
+    for given in (late, None):
         counter = TriggerCounter(teeth=3, teeth_per_trigger=1)
         corrector = MarkCorrector(counter, count=3, given=given, say=print)
         numbers = np.arange(601)

@@ -17,7 +17,7 @@ subtracted, and renewed after every `_RENEWED` revolutions. Where the pattern do
 mark is which, what was known before is not used, and `refused` counts it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -53,13 +53,12 @@ class MarkCorrector:
     """
 
     def __init__(self, counter: TriggerCounter, *, count: int,
-                 given: Sequence[float] | None = None, say: Callable[[str], None]) -> None:
+                 given: FloatArray | None = None, say: Callable[[str], None]) -> None:
         self._counter, self._count, self._say = counter, count, say
         self._learns = given is None
         self._known: MarkOffsets | None = None  # the latest that was not refused
         if given is not None:
-            angles = np.array(given, np.float64)
-            self._known = MarkOffsets(angles - angles.mean(), np.zeros(angles.size))
+            self._known = MarkOffsets(given - given.mean(), np.zeros(given.size))
         self.geometry: MarkOffsets | None = None
         self.teeth: IntArray = np.empty(0, np.int64)
         self.refused = 0

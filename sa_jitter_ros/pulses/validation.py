@@ -21,9 +21,8 @@ pulse is the one out of order.
 """
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import replace
 import math
-from operator import add
 from typing import Literal
 
 import numpy as np
@@ -35,7 +34,7 @@ from sa_jitter_ros.pulses.pulse_judge import PulseJudge
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
-from sa_jitter_ros.pulses.verdicts import Verdicts
+from sa_jitter_ros.pulses.verdicts import PulseCounts, Verdicts
 
 __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
@@ -46,40 +45,6 @@ _PIECE = 4096  # pulses judged at once
 _RESTART = 3  # pulses after time ran back that begin a new run
 _WHEEL_TOLERANCE = 0.25  # of the intervals in which the gaps of a wheel are found
 _KNOWN_TOLERANCE = 0.15  # of those of a wheel with known uneven marks
-
-
-@dataclass(frozen=True)
-class PulseCounts:
-    """
-    Number of pulses so far, by what the validation decided.
-
-    `accepted` pulses are regular, end a gap or start a run. Missing pulses are those that did not
-    arrive: interpolated (`missing_bridged`) or the end of a run (`missing_broken`). `late` pulses
-    start a run. All others were dropped; `unlocked` ones because no steady interval was known yet.
-    `relearnt` counts changes of speed within one or two intervals, `cycles_discarded` trigger
-    cycles that began and were lost, `restarts` how often time ran back, `geometry_refused` how
-    often the pulses did not fit what was known of the target's marks. `displaced` pulses, of
-    whatever kind, are those of a loose mark (`loose_marks`).
-    """
-
-    accepted: int = 0
-    doubles: int = 0
-    missing_bridged: int = 0
-    missing_broken: int = 0
-    early: int = 0
-    late: int = 0
-    out_of_order: int = 0
-    restarts: int = 0
-    non_finite: int = 0
-    unlocked: int = 0
-    relearnt: int = 0
-    cycles_discarded: int = 0
-    geometry_refused: int = 0
-    displaced: int = 0
-
-    def __add__(self, other: 'PulseCounts') -> 'PulseCounts':
-        """Return the counts of both."""
-        return PulseCounts(*map(add, astuple(self), astuple(other)))
 
 
 class PulseValidator:
@@ -169,7 +134,7 @@ class PulseValidator:
         self._corrector: MarkCorrector | None = None
         if target_geometry != 'none' and target.marks > 1:
             self._sink = self._corrector = MarkCorrector(
-                self._counter, count=teeth, given=given.tolist() or None, say=verdicts.say)
+                self._counter, count=teeth, given=given if given.size else None, say=verdicts.say)
         self._judge = PulseJudge(target, self._sink, JudgeOptions(
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
@@ -181,9 +146,9 @@ class PulseValidator:
     @property
     def counts(self) -> PulseCounts:
         """Return the counts so far."""
-        return PulseCounts(
-            **self._judge.verdicts.counts, cycles_discarded=self._counter.discarded,
-            geometry_refused=0 if self._corrector is None else self._corrector.refused)
+        refused = 0 if self._corrector is None else self._corrector.refused
+        return PulseCounts(**{**self._judge.verdicts.counts, 'geometry_refused': refused,
+                              'cycles_discarded': self._counter.discarded})
 
     @property
     def rejected(self) -> list[tuple[float, str]]:

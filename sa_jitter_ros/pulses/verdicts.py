@@ -11,11 +11,47 @@
 """What was decided about pulses, in numbers and in words."""
 
 from collections import deque
+from dataclasses import astuple, dataclass
+from operator import add
 
 #: Latest pulses that were rejected, or are missing, of which times and reasons are kept.
 REMEMBERED = 2000
 _MESSAGES = 10  # that wait
 _ALIKE = 8  # strays, each behind as many pulses as the one before, that are no chance
+
+
+@dataclass(frozen=True)
+class PulseCounts:
+    """
+    Number of pulses so far, by what the validation decided.
+
+    `accepted` pulses are regular, end a gap or start a run. Missing pulses are those that did not
+    arrive: interpolated (`missing_bridged`) or the end of a run (`missing_broken`). `late` pulses
+    start a run. All others were dropped; `unlocked` ones because no steady interval was known yet.
+    `relearnt` counts changes of speed within one or two intervals, `cycles_discarded` trigger
+    cycles that began and were lost, `restarts` how often time ran back, `geometry_refused` how
+    often the pulses did not fit what was known of the target's marks. `displaced` pulses, of
+    whatever kind, are those of a loose mark (`loose_marks`).
+    """
+
+    accepted: int = 0
+    doubles: int = 0
+    missing_bridged: int = 0
+    missing_broken: int = 0
+    early: int = 0
+    late: int = 0
+    out_of_order: int = 0
+    restarts: int = 0
+    non_finite: int = 0
+    unlocked: int = 0
+    relearnt: int = 0
+    cycles_discarded: int = 0
+    geometry_refused: int = 0
+    displaced: int = 0
+
+    def __add__(self, other: 'PulseCounts') -> 'PulseCounts':
+        """Return the counts of both."""
+        return PulseCounts(*map(add, astuple(self), astuple(other)))
 
 
 class Verdicts:
@@ -28,9 +64,7 @@ class Verdicts:
 
     def __init__(self, marks: int = 0) -> None:
         self._marks, self._apart, self._alike, self._before = marks, 0, 0, 0  # of strays
-        self.counts = dict.fromkeys(
-            ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
-             'unlocked', 'relearnt', 'displaced', 'out_of_order', 'restarts', 'non_finite'), 0)
+        self.counts = dict.fromkeys(PulseCounts.__dataclass_fields__, 0)
         self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
         self.messages: list[str] = []
 
