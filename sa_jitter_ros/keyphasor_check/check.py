@@ -313,14 +313,13 @@ class _Check:
         pattern = fitted.pattern
         scale = 2.0 * math.pi / pattern.teeth
         errors = np.nan_to_num(pattern.errors * scale, nan=0.0)
+        by = ('mean place of each mark over the revolutions, late positive; a ripple of the speed '
+              'with the revolution looks the same' if shown else '')
         if even:
-            return Checked([0.0] * pattern.present, errors.tolist(), 'rad', (), 'the lines of the '
-                           'vibration are sharper between even marks: the speed changes with the '
-                           'revolution')
-        return Checked(
-            (pattern.marks * scale).tolist(), errors.tolist() if pattern.teeth > 1 else None,
-            'rad', (), 'mean place of each mark over the revolutions, late positive; a ripple of '
-            'the speed with the revolution looks the same' if shown else '')
+            by = ('the lines of the vibration are sharper between even marks: the speed changes '
+                  'with the revolution')
+        return Checked((pattern.marks * scale).tolist(),
+                       errors.tolist() if pattern.teeth > 1 else None, 'rad', (), by)
 
     # --- clock and jitter ---
 

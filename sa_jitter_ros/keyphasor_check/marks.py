@@ -109,8 +109,7 @@ class FittedPulses:
         """Return how far pulses stand from a smooth motion, in s; it holds some of the motion."""
         in_a_row = np.convolve(np.diff(self.numbers) == 1, np.ones(3), 'valid') == 3.0
         third = np.diff(self.true, 3)[in_a_row]
-        return max(float(np.std(third)) / math.sqrt(20.0), _LEAST_SCATTER) if third.size else (
-            _LEAST_SCATTER)
+        return max(float(np.std(third)) / math.sqrt(20.0) if third.size else 0.0, _LEAST_SCATTER)
 
     def once_a_revolution(self) -> NDArray[np.bool_]:
         """Return the pulses (n,) of the mark that begins trigger cycles, all if there are few."""

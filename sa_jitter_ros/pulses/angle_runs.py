@@ -76,11 +76,10 @@ class AngleRuns:
         self._moduli, self._registers = moduli, registers
         self._tick = 0.0  # the latest step of an angle that stands between its steps
         self._time, self._value = np.empty(0), np.empty(0)
-        self._forget()
+        self._forget(0)
 
-    def _forget(self, kept: int | None = None) -> None:
-        """Forget the samples before `kept`, or all: the next one begins a run."""
-        kept = len(self._time) if kept is None else kept
+    def _forget(self, kept: int) -> None:
+        """Forget the samples before `kept`: the next one begins a run."""
         # From two whole blocks before those that are not decided on.
         self._time, self._value = self._time[kept:], self._value[kept:]
         self._decided = 0  # of them
@@ -99,7 +98,7 @@ class AngleRuns:
             while self._decide(found, ends=ends and last):
                 pass
         if ends:
-            self._forget()
+            self._forget(self._time.size)
         return found
 
     # --- what is usual ---

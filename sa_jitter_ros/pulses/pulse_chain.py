@@ -57,12 +57,12 @@ class Chain:
     levels: FloatArray
     unsteady: bool = False
 
-    @property
-    def scatter(self) -> float:
-        """Robust scatter of the levels about the better of two predictions."""
-        changes = [np.diff(self.levels, order) for order in (1, 2)]
-        squares = [item[np.isfinite(item)]**2 for item in changes]
-        return math.sqrt(min(map(_mean_square, filter(np.size, squares)), default=_PRIOR**2))
+
+def scatter_of(levels: FloatArray) -> float:
+    """Return the robust scatter of levels (n,) about the better of two predictions."""
+    changes = [np.diff(levels, order) for order in (1, 2)]
+    squares = [item[np.isfinite(item)]**2 for item in changes]
+    return math.sqrt(min(map(_mean_square, filter(np.size, squares)), default=_PRIOR**2))
 
 
 def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRAY_OF_ONE

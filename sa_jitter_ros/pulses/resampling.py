@@ -22,11 +22,11 @@ sinc) is below 0.001 dB up to 0.32 fs. Linear interpolation has the gain sinc^2(
 keyphasor that is sampled at fs, its loss is three times that of the pulse jitter.
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 import math
 
 import numpy as np
-from numpy.polynomial import chebyshev
+from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -140,7 +140,7 @@ def gain_below_nyquist(method: str, frequency: FloatArray) -> FloatArray:
     >>> gain_below_nyquist('linear', np.array([0.1, 0.25, 0.5])).round(3)
     array([0.968, 0.811,   nan])
     """
-    grid, gains = _table_of_gains(_known(method))
+    grid, gains = _table_of_gains(method)
     return np.where(frequency < 0.5, np.interp(frequency, grid, gains), np.nan)
 
 
@@ -148,10 +148,9 @@ def gain_below_nyquist(method: str, frequency: FloatArray) -> FloatArray:
 def _table_of_gains(method: str) -> tuple[FloatArray, FloatArray]:
     """Return frequencies up to half the sampling rate, and the gains there."""
     grid: FloatArray = np.linspace(0.0, 0.5, _GAIN_STEPS + 1)
-    nodes = chebyshev.chebpts1(_GAIN_DEGREE + 1)
-    through = chebyshev.chebfit(
-        nodes, interpolator_gain(method, 0.25 * (nodes + 1.0)), _GAIN_DEGREE)
-    return grid, np.asarray(chebyshev.chebval(4.0 * grid - 1.0, through), np.float64)
+    through = Chebyshev.interpolate(
+        partial(interpolator_gain, method), _GAIN_DEGREE, domain=[0.0, 0.5])
+    return grid, np.asarray(through(grid), np.float64)
 
 
 @lru_cache(maxsize=8)
@@ -225,7 +224,7 @@ def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction:
     """
     ends = (int(index.min()), int(index.max())) if index.size else (0, 0)
     return _weighted(samples, ends, (index, fraction, np.zeros(index.size), np.zeros(1)),
-                     _polynomials(_known(method), cutoff))
+                     _polynomials(method, cutoff))
 
 
 def interpolate_along(samples: FloatArray, origin: NDArray[np.int32], begin: FloatArray,
@@ -239,7 +238,7 @@ def interpolate_along(samples: FloatArray, origin: NDArray[np.int32], begin: Flo
     """
     ends = origin + begin + length * np.array([[u.min()], [u.max()]])
     return _weighted(samples, (math.floor(ends.min()) - 1, math.floor(ends.max()) + 1),  # rounding
-                     (origin, begin, length, u), _polynomials(_known(method), cutoff))
+                     (origin, begin, length, u), _polynomials(method, cutoff))
 
 
 def _weighted(samples: FloatArray, ends: tuple[int, int], places: _Places, polynomials: FloatArray

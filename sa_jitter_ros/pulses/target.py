@@ -25,7 +25,7 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.pulses.interval_model import WIDTH
 from sa_jitter_ros.pulses.mark_pattern import MarkPattern
 from sa_jitter_ros.pulses.pulse_chain import (
-    Chain, find_chain, STRAY_OF_MARKS, STRAY_OF_ONE, unsteadiness)
+    Chain, find_chain, scatter_of, STRAY_OF_MARKS, STRAY_OF_ONE, unsteadiness)
 from scipy.ndimage import median_filter
 
 # Pulses from which the interval is learnt: those of this time (s), in these limits.
@@ -147,8 +147,8 @@ class EvenTarget:
         levels = np.log(gaps / found.steps)
         ones = np.ones(self.marks, dtype=np.int64)
         return Lock(first=start + int(found.pulses[0]), slot=0, interval=float(np.exp(levels[0])),
-                    steps=ones, widths=ones.astype(np.float64),
-                    believed=np.zeros(self.marks), scatter=found.scatter, known=levels.size,
+                    steps=ones, widths=ones.astype(np.float64), believed=np.zeros(self.marks),
+                    scatter=scatter_of(found.levels), known=levels.size,
                     intervals=gaps[found.steps == 1], unsteady=found.unsteady)
 
 
@@ -217,7 +217,7 @@ class ToothedWheel:
                 slot, steps, widths, tolerance = found
                 lengths = intervals / np.roll(widths, -slot)
                 levels = np.log(lengths)
-                scatter = Chain(single, steps, levels).scatter
+                scatter = scatter_of(levels)
                 return Lock(first=int(single[0]), slot=slot, interval=float(guess[0]),
                             steps=steps, widths=widths, even=False, scatter=scatter,
                             believed=np.where(tolerance > self._tolerance, tolerance,

@@ -182,19 +182,15 @@ def recording_from_fields(arrays: Arrays, *, acquisition: int, given: Mapping[st
         values['tach_rate'] = values['sample_rate']
         remarks.append('the tach waveform has no tach_rate and as many samples as the vibration: '
                        'it is taken as sampled with it')
-    acquisitions = 1
-    if tach is not None and len(tach) > 1:
-        if len(tach) != len(vibration):
+    acquisitions = 1 if tach is None else len(tach)
+    if tach is not None and acquisitions > 1:
+        if acquisitions != len(vibration):
             raise RecordingError(
                 f'tach of {len(tach)} rows for {len(vibration)} rows of vibration: a recording '
                 'has one row of tach, or one for every row of vibration if each is an acquisition')
-        acquisitions = len(tach)
-    if not 0 <= acquisition < acquisitions:
-        raise RecordingError(
-            f'acquisition {acquisition}: the file has {acquisitions}, numbered from 0')
-    if acquisitions > 1:
-        row = slice(acquisition, acquisition + 1)
-        vibration, tach = vibration[row], None if tach is None else tach[row]
+        first = acquisition % acquisitions  # `read` refuses those that there are not
+        row = slice(first, first + 1)
+        vibration, tach = vibration[row], tach[row]
         for name in ('channel_names', 'units'):
             if len(values.get(name, ())) > 1:
                 values[name] = values[name][row]
