@@ -313,10 +313,9 @@ class AngleCrossings:
         latest = self._steps[-64:]
         least = np.append(self._steps, np.abs(np.subtract.outer(latest, latest)))
         step = float(least[least > 1e-9].min(initial=np.inf))
-        if not np.isfinite(step):
-            return 0.0
         multiples = self._steps / step
-        return step if np.mean(np.abs(multiples - np.rint(multiples)) < _MULTIPLE) > _MOST else 0.0
+        found = np.mean(np.abs(multiples - np.rint(multiples)) < _MULTIPLE) > _MOST
+        return step if found and math.isfinite(step) else 0.0
 
 
 def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> AngleRuns:

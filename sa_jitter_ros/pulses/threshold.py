@@ -355,8 +355,6 @@ def _lobes(samples: FloatArray) -> StateLevels | None:
     pauses = {'falling': _pauses(first_end, second), 'rising': _pauses(second_end, first)}
     longest = {way: float(item.max()) if item.size else math.inf for way, item in pauses.items()}
     steep, other = sorted(longest, key=lambda way: longest[way])
-    if math.isinf(longest[steep]):
-        return None
     # teeth all around a wheel leave a rest only where some are missing, and beside all of them
     usual = max(longest[steep] + 1.0, float(np.median(pauses[other]))) if (
         pauses[other].size) else math.inf

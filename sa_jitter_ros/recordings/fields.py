@@ -87,12 +87,10 @@ def given_fields(fields: Mapping[str, Any], keys: Collection[str] = ()
     values: dict[str, Any] = {}
     sources: dict[str, tuple[str, ...]] = {}
     for name, value in fields.items():
-        if value is None:
-            continue
         if isinstance(value, str) and value in keys:
             sources[name] = (value,)
         elif name in SAMPLE_FIELDS:
-            named = _listed(value) if isinstance(value, str) else ()
+            named = _listed(value)
             if not named or not set(named) <= set(keys):
                 raise RecordingError(f'{name}={value!s:.40}: the file has no such key; it has '
                                      f'{shown_keys(keys)}')
