@@ -47,15 +47,14 @@ _OTHER_SIZE, _SURE = 3.0, 4.0  # times as large; standard errors
 
 
 def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[float] = (),
-           ratio: float = 1.0, pulses_per_revolution: int = 1,
-           pulses_per_trigger: int | None = None, missing_teeth: int = 0,
-           jitter_std: float | None = None, **geometry: Any) -> tuple[str, ...]:
+           ratio: float = 1.0, jitter_std: float | None = None, **target: Any
+           ) -> tuple[str, ...]:
     """
     Return what contradicts each other in a recording and its declaration, a sentence each.
 
     `pulses` (n,) are its pulse times in s, None if it has none; `orders` are those in which the
-    user is interested, `jitter_std` in s is the declared one; `geometry` are `target_geometry` and
-    `target_angles` of `PulseValidator`, if given.
+    user is interested, `jitter_std` in s is the declared one; `target` are options of
+    `PulseValidator`.
 
     >>> from sa_jitter_ros.recordings.recording import ArraySource
     >>> time = np.arange(20_000) / 2e3
@@ -73,10 +72,8 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
     if mistake:
         return (mistake,)
     found = [*filter(None, [other_span(pulses, start, end)])]
-    target = {'pulses_per_revolution': pulses_per_revolution, 'missing_teeth': missing_teeth,
-              'pulses_per_trigger': pulses_per_trigger, **geometry}
     validated = _validated(pulses, target)
-    unfit = _unfit(pulses, missing_teeth, *validated) if validated else []
+    unfit = _unfit(pulses, target.get('missing_teeth', 0), *validated) if validated else []
     found += unfit
     if orders and not unfit:  # which has one cause with it
         found += weak_orders(recording, pulses, orders, ratio=ratio, **target)
@@ -90,7 +87,7 @@ def _validated(pulses: FloatArray, target: Mapping[str, Any]
     """Return the trigger pulses of pulses (n,) in s, and what found them; None if it cannot."""
     try:
         validator = PulseValidator(**{
-            **target, 'pulses_per_trigger': target['pulses_per_trigger'] or None})
+            **target, 'pulses_per_trigger': target.get('pulses_per_trigger') or None})
     except SaJitterError:
         return None
     pulses = pulses[:_MOST_VALIDATED]
