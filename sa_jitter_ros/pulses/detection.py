@@ -160,24 +160,22 @@ class KeyphasorDetector:
             polarity='auto' if not self._decided else (
                 'positive' if self._sign > 0.0 else 'negative'))
 
-    def update(self, samples: npt.ArrayLike, start_time: float, sample_rate: float) -> FloatArray:
+    def update(self, samples: FloatArray, start_time: float, sample_rate: float) -> FloatArray:
         """
         Take the next samples (n,), the first at `start_time` (s), and return new pulse times (s).
 
         A `start_time` more than half a sample from the end of the last block is a gap, across
-        which no pulse is found. A block that raises an error is a gap and changes nothing else.
-
-        :raises SignalError: wrong shape, not finite, or another sample rate than before.
+        which no pulse is found. The samples are finite, as parts of a `SampleBlock` and what a
+        `VibrationTimeline` returns; another `sample_rate` needs another detector.
         """
-        block = self._checked(samples, start_time, sample_rate)
         self._rate, self._shortest = sample_rate, max(
             round(self._learning_time * sample_rate), _FEWEST)
         if not abs(start_time - (self._origin + self._index / sample_rate)) <= 0.5 / sample_rate:
             self._origin, self._index = start_time, 0
         found = []
-        window = self._shortest if self._learns else max(block.size, 1)
-        while block.size:
-            piece, block = np.split(block, [window - self._held % window])
+        window = self._shortest if self._learns else max(samples.size, 1)
+        while samples.size:
+            piece, samples = np.split(samples, [window - self._held % window])
             part = self._origin, self._index, self._sign * piece
             if self._levels or not self._learns:
                 found.append(self._detect(part))
@@ -196,27 +194,6 @@ class KeyphasorDetector:
             found = self._learn(size, whole=size < self._held)
             size = size // 2 if size > self._shortest else 0
         return found
-
-    def _checked(self, samples: npt.ArrayLike, start_time: float, sample_rate: float
-                 ) -> FloatArray:
-        given = np.asarray(samples)
-        if given.ndim != 1:
-            raise SignalError(f'the keyphasor waveform has shape {given.shape}: give one channel')
-        if given.dtype.kind not in 'fiub':
-            raise SignalError(f'the keyphasor waveform has type {given.dtype}: give real numbers')
-        if not (np.isfinite(sample_rate) and sample_rate > 0.0):
-            raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
-        if self._rate and sample_rate != self._rate:
-            raise SignalError(f'sample rate {sample_rate} Hz differs from {self._rate} Hz before: '
-                              'reset the detector to begin a new stream')
-        if not np.isfinite(start_time):
-            raise SignalError(f'start time {start_time} s of a block must be finite')
-        block = given.astype(np.float64)
-        if not np.all(np.isfinite(block)):
-            bad = int(np.argmin(np.isfinite(block)))
-            raise SignalError(f'sample {bad} of the block is {given[bad]}: samples must be '
-                              'finite; leave the block out, which makes a gap')
-        return block
 
     def _review(self, window: int) -> FloatArray:
         """Learn from the shortest window that holds whole pulses; each is twice as long."""
@@ -417,8 +394,14 @@ def detect_pulses(
     sample_rate = number('sample_rate', sample_rate)
     start_time = number('start_time', start_time)
     samples = np.asarray(tach)
-    if samples.ndim != 1 or samples.dtype.kind not in 'fiub':
-        detector.update(samples, start_time, sample_rate)  # raises the error
+    if samples.ndim != 1:
+        raise SignalError(f'the keyphasor waveform has shape {samples.shape}: give one channel')
+    if samples.dtype.kind not in 'fiub':
+        raise SignalError(f'the keyphasor waveform has type {samples.dtype}: give real numbers')
+    if not 0.0 < sample_rate < np.inf:
+        raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
+    if not np.isfinite(start_time):
+        raise SignalError(f'start time {start_time} s must be finite')
     block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
     pulses = pulses_in_blocks(detector, [block])
     state, said = detector.state, [spikes_text(detector.state.spikes)]
