@@ -226,6 +226,8 @@ def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, m
     ({'vibration': np.ones((2, 9)), 'sample_rate': 1.0, 'tach': np.ones((3, 9)),
       'tach_rate': 1.0}, 'tach of 3 rows for 2'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach_count': [1, 2]}, 'tach_rate'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach_count': [1, 2], 'tach_rate': np.inf},
+     'tach_rate is inf'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'pulse_times': np.ones((2, 2))}, 'one row'),
     ({'vibration': np.ones(3), 'sample_rate': 1.0, 'description': 'x' * 300_000}, 'exceed'),
 ])
