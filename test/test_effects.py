@@ -17,7 +17,7 @@ from inspect import signature
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import (
-    Effect, EFFECTS, enabled_effects, library, make_effect, parameter_defaults, parameter_ranges)
+    Effect, EFFECTS, enabled_effects, library, make_effect, parameter_ranges)
 from sa_jitter_ros.effects.effect import departs
 from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.effects.target_geometry import marks_ahead
@@ -78,7 +78,7 @@ def check(prediction, amplitudes, sampled=10**9):
 def test_registry_has_the_effects_of_the_contract():
     assert set(EFFECTS) == set(SMALL)
     assert list(parameter_ranges(EFFECTS['correlated_jitter'])) == ['std', 'correlation']
-    assert parameter_defaults(EFFECTS['excess_jitter']) == {'std': 0.0}
+    assert parameter_ranges(EFFECTS['excess_jitter'])['std'].default == 0.0
     assert parameter_ranges(EFFECTS['speed_fluctuation'])['acceleration_std'].unit == 'rad/s^2'
 
 

@@ -18,6 +18,7 @@ An effect is one frozen dataclass whose fields are its parameters. It overrides 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 import math
+import operator
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,6 +27,7 @@ from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
 from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.prediction.amplitudes import scenario_cycles, SCENARIOS
 from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -41,37 +43,28 @@ SEEN = 0.25
 ODDS = 5.0
 
 
-@dataclass(frozen=True)
-class ParameterRange:
-    """Description, SI unit and range of one parameter; `choices` are those of a text."""
-
-    description: str
-    unit: str
-    minimum: float = -math.inf
-    maximum: float = math.inf
-    above: float = -math.inf
-    choices: tuple[str, ...] = ()
-
-    def check(self, name: str, value: Any) -> None:
-        """Raise ParameterError unless the value, or every one of a list, is in range."""
-        if self.choices:
-            if value not in self.choices:
-                raise ParameterError(f'{name} is {value!r}: give one of {", ".join(self.choices)}')
-            return
-        for number in value if isinstance(value, tuple) else (value,):
-            if not (isinstance(number, (int, float)) and math.isfinite(number)
-                    and self.minimum <= number <= self.maximum and number > self.above):
-                limits = [f'at least {self.minimum:g}'] if math.isfinite(self.minimum) else []
-                limits += [f'more than {self.above:g}'] if math.isfinite(self.above) else []
-                limits += [f'at most {self.maximum:g}'] if math.isfinite(self.maximum) else []
-                unit = f' {self.unit}' if self.unit != '1' else ''
-                raise ParameterError(f'{name} is {number}{unit}: give a finite number' + ''.join(
-                    f', {limit}' for limit in limits))
-
-
 def parameter(default: Any, description: str, unit: str, **limits: Any) -> Any:
-    """Return the dataclass field of a parameter; `limits` are those of `ParameterRange`."""
-    return field(default=default, metadata={'range': ParameterRange(description, unit, **limits)})
+    """Return the dataclass field of a parameter; `limits` are those of `Parameter`."""
+    listed = list(default) if isinstance(default, tuple) else default
+    return field(default=default, metadata={
+        'range': Parameter('', listed, description, unit, **limits)})
+
+
+def _require_range(name: str, value: Any, limits: Parameter) -> None:
+    """Raise ParameterError unless the value, or every one of a list, is in range."""
+    if limits.choices:
+        if value not in limits.choices:
+            raise ParameterError(f'{name} is {value!r}: give one of {", ".join(limits.choices)}')
+        return
+    given = [(word, limit, holds) for word, limit, holds in (
+        ('at least', limits.minimum, operator.ge), ('more than', limits.above, operator.gt),
+        ('at most', limits.maximum, operator.le)) if limit is not None]
+    for number in value if isinstance(value, tuple) else (value,):
+        if not (isinstance(number, (int, float)) and math.isfinite(number)
+                and all(holds(number, limit) for _, limit, holds in given)):
+            unit = f' {limits.unit}' if limits.unit != '1' else ''
+            raise ParameterError(f'{name} is {number}{unit}: give a finite number' + ''.join(
+                f', {word} {limit:g}' for word, limit, _ in given))
 
 
 def largest_power(value: float, count: float, noise: float, square: float, memory: float
@@ -128,13 +121,11 @@ class Effect(Influence):
 
     #: How it shows in pulse times and recovered pulse errors, None where it does not.
     timing: ClassVar[Spectrum | Pattern | None] = None
-    #: What would distinguish it from the effects that look like it.
-    deciding_measurement: ClassVar[str] = 'a longer recording, or one at other speeds'
 
     def __post_init__(self) -> None:
         """Check every parameter."""
         for name, limits in parameter_ranges(type(self)).items():
-            limits.check(f'{self.name}.{name}', getattr(self, name))
+            _require_range(f'{self.name}.{name}', getattr(self, name), limits)
 
     @property
     def random(self) -> bool:
@@ -275,15 +266,10 @@ def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles:
     return beyond_chance(0.5 * float(np.sum(np.square(away))), len(away), cycles) > ODDS
 
 
-def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:
+def parameter_ranges(kind: type) -> Mapping[str, Parameter]:
     """Return the ranges of an effect's parameters by name, in their order."""
     return {item.name: item.metadata['range'] for item in fields(kind)
             if 'range' in item.metadata}
-
-
-def parameter_defaults(kind: type) -> Mapping[str, Any]:
-    """Return the defaults of an effect's parameters by name, in their order."""
-    return {item.name: item.default for item in fields(kind) if 'range' in item.metadata}
 
 
 def effects_of(findings: Iterable[Finding]) -> list[Effect]:

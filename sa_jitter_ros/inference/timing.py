@@ -53,6 +53,8 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
+#: What distinguishes an effect from those that look like it.
+_DECIDING = 'a longer recording, or one at other speeds'
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
     else:
         chooser.fit(names)
         choice = chooser.choice(names)
-    findings = tuple(_findings(chooser, choice, declared))
+    findings = _findings(chooser, choice, declared)
     return Timing(findings, _probabilities(choice, findings), chooser, choice)
 
 
@@ -220,7 +222,7 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
     fit = chooser.fit(best, starts)
     choice = replace(timing.choice, fits={**timing.choice.fits, best: fit},
                      setting=chooser.setting)
-    findings = tuple(_findings(chooser, choice, declared))
+    findings = _findings(chooser, choice, declared)
     if _chosen(findings) != _chosen(timing.findings):
         return timing
     return Timing(findings, timing.probabilities, chooser, choice)
@@ -251,7 +253,8 @@ def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
     return float(special.chdtrc(max(choice.fit.count - without.count, 1), 2.0 * gain))
 
 
-def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> list[Finding]:
+def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]
+              ) -> tuple[Finding, ...]:
     found = []
     for name in sorted(choice.best):
         if name == JITTER:
@@ -263,13 +266,15 @@ def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> l
         found += [beside] if beside else []
     if other_clock := _other_clock(chooser):
         found.append(other_clock)
-    speed = _of_speed(choice, declared)
-    return [*found, speed] if speed else found
+    if speed := _of_speed(choice, declared):
+        found.append(speed)
+    return tuple(replace(item, deciding_measurement=_DECIDING)
+                 if item.indistinguishable_from else item for item in found)
 
 
 def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding | None:
     """Return a spectrum or pattern as effect, None where it is out of range."""
-    fit, kind, found = choice.fit, EFFECTS[name], chooser.effect(name, choice.fit)
+    fit, found = choice.fit, chooser.effect(name, choice.fit)
     if found is None:
         return None
     effect, errors = found
@@ -279,9 +284,10 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding | None:
                    if other not in NO_EFFECTS)
     if {RIPPLE, BAND} & {*choice.rivals(name)}:
         rivals = (*rivals, _SPEED)
-    return Finding(name, effect, errors, _p_value(choice, name, chooser),
-                   _text(choice, name, effect, errors), indistinguishable_from=rivals,
-                   deciding_measurement=kind.deciding_measurement if rivals else '')
+    text = (f'{effect.summary}: {_sizes(effect, errors)}{effect.remark(choice.setting.model)}, '
+            'which pulse times and errors recovered from the vibration show')
+    return Finding(name, effect, errors, _p_value(choice, name, chooser), text,
+                   indistinguishable_from=rivals)
 
 
 def _by_angle(effect: ClockSkew, fit: TimingFit) -> ClockSkew:
@@ -292,13 +298,6 @@ def _by_angle(effect: ClockSkew, fit: TimingFit) -> ClockSkew:
     apart = (by_angle - skew) ** 2 / (known[0, 0] - 2.0 * known[0, 1] + known[1, 1])
     both = beyond_chance(0.5 * apart, 1, fit.data.cycles) > ODDS
     return replace(effect, by_angle=by_angle / skew if both else 1.0)
-
-
-def _text(choice: Choice, name: str, effect: Effect, errors: Mapping[str, Any]) -> str:
-    """Say what was found and how surely."""
-    remark = effect.remark(choice.setting.model)
-    return (f'{effect.summary}: {_sizes(effect, errors)}{remark}, which pulse times and errors '
-            f'recovered from the vibration show')
 
 
 def _sizes(effect: Effect, errors: Mapping[str, Any]) -> str:
@@ -339,15 +338,13 @@ def _of_jitter(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> 
         if math.inf > odds > DECIDED:
             text += '; their distribution is the declared one, as wide'
         return Finding(JITTER, JitterScale(scale), {'scale': 0.5 * scale * error}, p_value, text,
-                       indistinguishable_from=rivals,
-                       deciding_measurement=JitterScale.deciding_measurement if rivals else '')
+                       indistinguishable_from=rivals)
     share = max(1.0 - (least / scale) ** 2, 1e-9)  # of all power
     effect, errors = EFFECTS[EXCESS].of_timing(
         np.array([log_power + math.log(share)]), np.array([normal_error / share]), setting)
     if odds > -DECIDED:
         rivals = (JITTER, *rivals)
-    return Finding(EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,
-                   deciding_measurement=EFFECTS[EXCESS].deciding_measurement if rivals else '')
+    return Finding(EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals)
 
 
 def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:

@@ -71,7 +71,7 @@ PARAMETERS = (
 # Sizes at which an effect is significant as soon as it is enabled.
 EFFECT_DEFAULTS = {
     'excess_jitter.std': 2e-5, 'correlated_jitter.std': 2e-5, 'correlated_jitter.correlation': 0.8,
-    'target_geometry.pulse_angles': (0.0, 0.005), 'clock_skew.skew': 1e-5,
+    'target_geometry.pulse_angles': [0.0, 0.005], 'clock_skew.skew': 1e-5,
     'keyphasor_quantisation.clock_rate': 5000.0, 'missing_pulses.probability': 0.02,
     'speed_fluctuation.acceleration_std': 10.0, 'phase_wander.std': 0.01,
     'amplitude_modulation.std': 0.2, 'additive_noise.std': 0.5,
