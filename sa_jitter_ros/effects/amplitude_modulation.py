@@ -20,13 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
-    fading, flat_band_correlation, memory, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
+    memory, NARROWEST, SLOW_BAND, slow_band, slow_covariance, slow_memory, WIDEST)
 from sa_jitter_ros.effects.common_gain import correlations, fit_common_gain
 from sa_jitter_ros.effects.effect import (
     absent, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
+from sa_jitter_ros.prediction.angle_error import drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.pulses.angle_law import Covariance
 from sa_jitter_ros.pulses.resampling import FULL_BAND
 
 
@@ -43,11 +44,10 @@ class SlowGain:
         """Return the memory in cycles."""
         return slow_memory(self.trigger_cycles, self.band)
 
-    def covariance(self, u: Array, v: Array, lag: int) -> Array:
+    @property
+    def covariance(self) -> Covariance:
         """Return Cov[a_k(u), a_{k+lag}(v)]."""
-        apart = lag + v - u
-        return np.asarray(self.variance * fading(apart, self.trigger_cycles, self.band)
-                          * flat_band_correlation(apart, self.band))
+        return slow_covariance(self.variance, self.trigger_cycles, self.band)
 
     def characteristic(
         self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
@@ -90,9 +90,7 @@ class AmplitudeModulation(DirectEffect):
         """Return the gain, band-limited below half the trigger rate."""
         if self.std == 0.0:
             return ()
-        processes: Sequence[AngleErrorProcess] = (
-            SlowGain(self.std**2, model.trigger_cycles, slow_band(self.bandwidth)),)
-        return processes
+        return (SlowGain(self.std**2, model.trigger_cycles, slow_band(self.bandwidth)),)
 
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:

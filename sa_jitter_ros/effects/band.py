@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.prediction.angle_error import unit_nodes
+from sa_jitter_ros.pulses.angle_law import Covariance
 
 #: Of what wanders or modulates, as a fraction of the trigger rate: below half of it by definition.
 #: It may be slower than any record, as load and temperature are.
@@ -79,6 +80,15 @@ def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
     x = np.asarray(lag, float)
     return np.asarray((high * np.sinc(2.0 * high * x) - low * np.sinc(2.0 * low * x))
                       / (high - low))
+
+
+def slow_covariance(variance: float, trigger_cycles: int, band: tuple[float, float]) -> Covariance:
+    """Return the covariance of a motion of that variance in `band`, which ends with the memory."""
+    def covariance(u: Array, v: Array, lag: int) -> Array:
+        apart = lag + v - u
+        return np.asarray(variance * fading(apart, trigger_cycles, band)
+                          * flat_band_correlation(apart, band))
+    return covariance
 
 
 def memory(band: tuple[float, float]) -> float:

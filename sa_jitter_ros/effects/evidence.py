@@ -21,7 +21,7 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array, IntArray
 from sa_jitter_ros.effects.lattice import Clock
-from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
+
 from sa_jitter_ros.prediction.influence import (
     AveragePulses, declared_jitter, Influence, mean_period)
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -117,14 +117,9 @@ class Evidence:
     explained: tuple[Influence, ...] = ()
 
     @property
-    def periods(self) -> Array:
-        """Return the mean trigger period of each acquisition (acquisition,) in s."""
-        return np.array([mean_period(pulses.times, pulses.missing) for pulses in self.pulses])
-
-    @property
     def period(self) -> float:
         """Return the mean trigger period in s."""
-        return float(np.mean(self.periods))
+        return float(np.mean([mean_period(item.times, item.missing) for item in self.pulses]))
 
     @property
     def cycles(self) -> int:
@@ -153,14 +148,10 @@ class Evidence:
         """Return when the pulses were measured (acquisition, N_t + 1), in s."""
         return np.array([pulses.times for pulses in self.pulses])
 
-    @property
-    def jitter(self) -> PulseErrorDistribution | None:
-        """Return what is left of the declared jitter beside the added effects, if anything."""
-        return declared_jitter(self.model, self.explained)
-
     def expected_autocovariance(self, lags: Array) -> Array:
         """Return what declared jitter and added effects explain at `lags`, in s^2."""
-        total = np.where(lags == 0, self.jitter.variance if self.jitter else 0.0, 0.0)
+        jitter = declared_jitter(self.model, self.explained)
+        total = np.where(lags == 0, jitter.variance if jitter else 0.0, 0.0)
         for effect in self.explained:
             total = total + effect.pulse_autocovariance(self.model, lags)
         return np.asarray(total)

@@ -19,9 +19,7 @@ from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding, paramete
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.pulses.resampling import interpolator_gain as interpolator_gain
-
-METHODS = ('band_limited', 'linear', 'cubic', 'spline')
+from sa_jitter_ros.pulses.resampling import interpolator_gain, METHODS
 
 
 @dataclass(frozen=True)

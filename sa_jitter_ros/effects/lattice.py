@@ -91,12 +91,11 @@ def smooth_on_grid(times: Array, clock_rate: float) -> Array:
     direction method of multipliers.
     """
     n = times.size
-    half = 0.5
-    index = np.arange(n)
-    trend = np.polynomial.Polynomial.fit(index, times, 1)(index)
-    middle = (times - trend) * clock_rate  # ticks; the true time lies within `half` of it
     if n < 3:
         return np.zeros(n)
+    half, index = 0.5, np.arange(n)
+    trend = np.polynomial.Polynomial.fit(index, times, 1)(index)
+    middle = (times - trend) * clock_rate  # ticks; the true time lies within `half` of it
     penalty = _squared_second_difference(n)
     mass = 0.02
     factors = {}
@@ -141,7 +140,7 @@ def ticks_leave_room(errors: Sequence[Array], variance: float, clock_rate: float
     return bool(beyond < max(variance, (ROOM / clock_rate) ** 2))
 
 
-def ticks_log_likelihood(errors: Sequence[Array], variance: float, clock_rate: float) -> float:
+def _log_likelihood(errors: Sequence[Array], variance: float, clock_rate: float) -> float:
     """
     Return how likely a clock makes the pulse errors (pulse,) of some stretches, in s.
 
@@ -165,8 +164,7 @@ def sizes_within_ticks(left: Callable[[float], Sequence[Array]], tried: Array, v
     (pulse,) of some stretches in s, and `variance` is that of what they are wrong by.
     """
     possible = tried[[ticks_leave_room(left(size), variance, clock_rate) for size in tried]]
-    likely = np.array([ticks_log_likelihood(left(size), variance, clock_rate)
-                       for size in possible])
+    likely = np.array([_log_likelihood(left(size), variance, clock_rate) for size in possible])
     return possible, special.softmax(likely) if likely.size else likely
 
 
@@ -180,10 +178,7 @@ def within_half_tick(errors: Array, clock_rate: float) -> Array:
 
 def _squared_second_difference(n: int) -> Array:
     """Return D'D of the second difference, upper banded form (3, n)."""
-    bands = np.zeros((3, n))
-    for shift, weight in ((0, 1.0), (1, -2.0), (2, 1.0)):
-        for other, factor in ((0, 1.0), (1, -2.0), (2, 1.0)):
-            if other >= shift:
-                k = other - shift
-                bands[2 - k, other:n - 2 + other] += weight * factor
+    bands, difference = np.zeros((3, n)), np.array([1.0, -2.0, 1.0])
+    for k in range(3):
+        bands[2 - k, k:] = np.convolve(np.ones(n - 2), difference[:3 - k] * difference[k:])
     return bands

@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
-    ACCELERATION_BAND, fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND,
-    slow_band, slow_memory, WIDEST)
+    ACCELERATION_BAND, NARROWEST, recovered_correlation, SLOW_BAND, slow_band, slow_covariance,
+    slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import Effect, parameter, require_below
 from sa_jitter_ros.effects.timing import FAINT, LARGE, low_passed, Setting, SOURCE, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
@@ -59,14 +59,9 @@ class PhaseWander(Effect):
             return ()
         require_below('phase_wander.std', self.std, 2.0 * np.pi, 'rad', 'a source that turns '
                       'freely relative to the shaft has no orders of it; lower it')
-        variance, band = (self.std / (2.0 * np.pi)) ** 2, slow_band(self.bandwidth)
-
-        def covariance(u: Array, v: Array, lag: int) -> Array:
-            apart = lag + v - u
-            return np.asarray(variance * fading(apart, model.trigger_cycles, band)
-                              * flat_band_correlation(apart, band))
-
-        return (GaussianAngleError(covariance, slow_memory(model.trigger_cycles, band)),)
+        cycles, band = model.trigger_cycles, slow_band(self.bandwidth)
+        return (GaussianAngleError(slow_covariance((self.std / (2.0 * np.pi)) ** 2, cycles, band),
+                                   slow_memory(cycles, band)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return the autocovariance of the pulse errors that the recovery makes of the wander."""

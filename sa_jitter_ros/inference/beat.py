@@ -25,12 +25,12 @@ import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.evidence import Beat
-from sa_jitter_ros.pulses.resampling import interpolator_gain
+from sa_jitter_ros.pulses.resampling import interpolator_gain, METHODS
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import minimize_scalar
 
-METHODS = ('linear', 'cubic', 'spline')
+_LOSSY = tuple(method for method in METHODS if method != 'band_limited')
 _HARMONICS = 4  # of the beat
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
 _LOBE = 17  # frequencies, in which the window spreads one
@@ -73,7 +73,7 @@ def find_beat(radial: Array, times: Array, order: Array, frequency: Array) -> Be
     seen = np.sum(np.abs(swings) ** 2 / noise, axis=1)
     tops = np.flatnonzero(seen == maximum_filter1d(seen, _LOBE))  # beside them it is less deep
     best = -np.inf
-    for method in METHODS:
+    for method in _LOSSY:
         # over the place between two samples; the images of a line swing about it
         below, mean, above = (interpolator_gain(method, frequency + k) for k in (-1.0, 0.0, 1.0))
         swing = np.abs(below + above)
@@ -90,7 +90,7 @@ def find_beat(radial: Array, times: Array, order: Array, frequency: Array) -> Be
     peaks = int(np.count_nonzero((rival[1:-1] > ODDS) & (rival[1:-1] > rival[:-2])
                                  & (rival[1:-1] >= rival[2:])))
     # each method, and each line that stands there by itself and may look like a beat
-    tried += np.log(len(METHODS) * max(peaks, 1))
+    tried += np.log(len(_LOSSY) * max(peaks, 1))
     gained, p_value = float(best - tried), float(np.exp(min(tried - best, 0.0)))
     if gained <= ODDS:
         return Beat(gained, p_value)
