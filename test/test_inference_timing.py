@@ -105,7 +105,7 @@ def test_what_sets_stretches_apart_has_the_power_of_its_frequency(sizes, name):
         parts = without_the_middle(machine([61, seed], **sizes))
         fit = Chooser(parts, []).fit(frozenset([name] if name else []))
         assert fit.data.each[0] < fit.data.each[1] == 1.0 / fit.data.longest
-        power = np.linalg.inv(fit.spectrum(fit.parameters))[0]
+        power = np.linalg.inv(fit.spectrum)[0]
         apart = fit.data.ordinates[0]
         ratios.append(float((apart.conj() @ power @ apart).real) / fit.data.series)
     # of squares of three normal variables

@@ -154,7 +154,7 @@ def _shape(chooser: Chooser, choice: Choice) -> Check:
     may have the declared distribution, too.
     """
     fit, data = choice.fit, chooser.data
-    white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
+    white = 1.0 / np.sqrt(fit.spectrum[:, 1, 1].real)
     p_value = _likeness(chooser, choice, white)
     names = [*fit.spectra, *([JITTER] if JITTER in fit.place else [])]
     power = sum(float(np.average(fit.contribution(name)[:, 1, 1].real, weights=data.size))
@@ -170,7 +170,7 @@ def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
     An event that the memory lets fade is what the matched filter of a component shows best.
     """
     fit, data = choice.fit, chooser.data
-    total = fit.spectrum(fit.parameters)[:, 1, 1].real
+    total = fit.spectrum[:, 1, 1].real
     made = fit.contribution(name)[:, 1, 1].real
     even = np.linspace(0.0, 0.5, data.longest)
     response = np.interp(data.frequency, even, _minimum_phase(
@@ -228,21 +228,20 @@ def _likeness(chooser: Chooser, choice: Choice, gain: Array) -> float:
 
 def _steadiness(chooser: Chooser, choice: Choice) -> Check:
     """Test whether the pulse errors are as large in all parts of the recording."""
-    data = choice.fit.data
+    fit, data = choice.fit, choice.fit.data
     items = [item for item in data.stretches if item.errors.size >= _FEWEST]
-    seen = [power for item in items for power in _powers(chooser, choice, item, None)]
+    seen = [power for item in items for power in _powers(fit, chooser.left(fit, item))]
     if len(seen) < 2:
         return Check(1.0, PULSES, 0.0, 'the size of the pulse errors')
     logs, p_value = np.log(np.array(seen)), 0.0
     place = np.arange(logs.size) - 0.5 * (logs.size - 1)  # most change along the recording
     for kind in _kinds(choice):
         null = np.log(np.array([power for item in items for power in _powers(
-            chooser, choice, item, _drawn(choice, item, kind))]))
+            fit, _drawn(choice, item, kind))]))
         each = (chance(float(np.var(logs)), np.var(null, axis=0)),
                 chance(float(abs(place @ logs)), np.abs(place @ null)))
         p_value = max(p_value, min(1.0, len(each) * min(each)))
-    power = float(np.average(choice.fit.spectrum(choice.fit.parameters)[:, 1, 1].real,
-                             weights=data.size))
+    power = float(np.average(fit.spectrum[:, 1, 1].real, weights=data.size))
     size = float(np.ptp(np.exp(logs - np.median(null))))
     return Check(p_value, PULSES, data.unit * math.sqrt(size * power),
                  f'the power of the pulse errors is {float(np.exp(logs.max() - logs.min())):.2g} '
@@ -260,12 +259,9 @@ def _kinds(choice: Choice) -> Sequence[str]:
     return _DECLARED, *scaled, *([_TICKS] if choice.setting.clock_rate else [])
 
 
-def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None) -> list[Array]:
-    """Return the power of whitened errors (part, draw) in parts of a stretch."""
-    fit, data = choice.fit, choice.fit.data
-    white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
-    errors = chooser.left(choice.fit, item) if drawn is None else drawn
-    values = _filtered(errors, white, data)
+def _powers(fit: TimingFit, errors: Array) -> list[Array]:
+    """Return the power (part, ...) of errors (..., pulse), whitened, in parts of a stretch."""
+    values = _filtered(errors, 1.0 / np.sqrt(fit.spectrum[:, 1, 1].real), fit.data)
     parts = np.array_split(values, max(1, values.shape[-1] // _FEWEST), axis=-1)
     return [np.asarray(np.mean(part**2, axis=-1)) for part in parts]
 
@@ -287,7 +283,7 @@ def _drawn(choice: Choice, item: Stretch, kind: str) -> Array:
         declared = math.sqrt(power) / data.unit * np.asarray(
             choice.setting.model.distribution.draw(rng, shape))
     gain = np.abs(data.passed[:, 1, 1])
-    total = fit.spectrum(fit.parameters)[:, 1, 1].real
+    total = fit.spectrum[:, 1, 1].real
     rest = np.sqrt(np.maximum(total - data.measured * power * gain**2, 0.0))
     drawn = through(declared, gain, data) + through(rng.standard_normal(shape), rest, data)
     return drawn[:, beyond:-beyond]

@@ -35,9 +35,9 @@ from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.effects.timing import (
     FAINT, LARGE, MOTION, Pattern, PULSES, Setting, SOURCE, Spectrum)
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.inference.timing_data import Stretch, TimingData
+from sa_jitter_ros.inference.timing_data import of_measured, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
-from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
+from sa_jitter_ros.inference.timing_shape import Shapes
 
 #: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
 RIPPLE = 'ripple'
@@ -63,15 +63,13 @@ class Choice:
     """
     The best set of effects, and all sets that were tried with their evidence.
 
-    `fits` maps sets of names to their fits, `scores` to their evidence. `declared` are the effects
-    that are part of the declared model: in a set, their parameters are in question.
+    `fits` maps sets of names to their fits, `scores` to their evidence.
     """
 
     best: frozenset[str]
     fits: Mapping[frozenset[str], TimingFit]
     scores: Mapping[frozenset[str], float]
     setting: Setting
-    declared: tuple[Effect, ...]
 
     @property
     def fit(self) -> TimingFit:
@@ -159,38 +157,28 @@ class Chooser:
 
         Of a single pattern, the sizes that leave the errors within the ticks give its value.
         """
-        fit = self.fit(names)
-        found = {name: np.concatenate([self.patterns[name][0].columns(item.setting)
-                                       for item in self.data.stretches], axis=1) for name in names}
-        sizes = {name: fit.pattern(name)[0] for name in names}
-        if len(names) != 1 or fit.sizes.size != 1:
-            left = self._left([sizes[name] @ found[name] for name in names])
-            return fit if ticks_leave_room(*left) else None
-        (column,) = found[min(names)]
-        step = _STEP / (self.setting.clock_rate * self.data.unit * float(np.ptp(column)))
+        fit, rate = self.fit(names), self.setting.clock_rate
+        noise = float(np.mean([item.error_std**2 for item in self.data.stretches]))
+        columns = [np.concatenate([np.zeros((0, item.errors.size)), *(
+            self.patterns[name][0].columns(item.setting) for name in fit.columns)])
+            for item in self.data.stretches]
+
+        def left(sizes: Array) -> list[Array]:
+            return [(item.errors - self.data.unit * (sizes @ some))[item.measured]
+                    for item, some in zip(self.data.stretches, columns)]
+
+        if fit.sizes.size != 1:
+            return fit if ticks_leave_room(left(fit.sizes), noise, rate) else None
+        step = _STEP / (rate * self.data.unit * float(np.ptp(np.concatenate(columns, axis=1))))
         tried = fit.sizes[0] + step * np.arange(-round(1.0 / _STEP), round(1.0 / _STEP) + 1)
-        _, variance, rate = self._left([])
         possible, weight = sizes_within_ticks(
-            lambda size: self._left([size * column])[0], tried, variance, rate)
+            lambda size: left(np.array([size])), tried, noise, rate)
         if not possible.size:
             return None
         fit = copy(fit)
         fit.sizes = np.array([possible @ weight])
         fit.size_covariance = np.array([[(possible - fit.sizes) ** 2 @ weight + step**2 / 12.0]])
         return fit
-
-    def _left(self, known: Sequence[Array]) -> tuple[list[Array], float, float]:
-        """Return the errors less `known` ones in s, their variance, and the rate of the clock."""
-        begin, found = 0, []
-        for item in self.data.stretches:
-            part = slice(begin, begin + item.errors.size)
-            begin = part.stop
-            left = item.errors.copy()
-            for row in known:
-                left -= self.data.unit * row[part]
-            found.append(left[item.measured])
-        noise = float(np.mean([item.error_std**2 for item in self.data.stretches]))
-        return found, noise, self.setting.clock_rate
 
     def score(self, names: frozenset[str], fit: TimingFit) -> float:
         """Return the logarithm of the evidence for a set of effects, its prior odds included."""
@@ -261,18 +249,17 @@ class Chooser:
 
     def left(self, fit: TimingFit, stretch: Stretch) -> Array:
         """Return the errors (pulse,) that patterns and a trend leave, in units."""
-        return errors_left(stretch, self.data.unit, self._known_errors(fit, stretch))
-
-    def _known_errors(self, fit: TimingFit, stretch: Stretch) -> Array:
-        """Return what declared patterns, and those of a fit, make of the pulses, in units."""
-        total = np.zeros(stretch.errors.size)
-        for name in self.patterns.keys() - {RIPPLE}:
-            columns = self.patterns[name][0].columns
+        place, known = np.arange(stretch.errors.size), np.zeros(stretch.errors.size)
+        for name, (pattern, _) in self.patterns.items():
+            if name == RIPPLE:
+                continue
             if name in fit.columns:
-                total += fit.pattern(name)[0] @ columns(stretch.setting)
+                known += fit.pattern(name)[0] @ pattern.columns(stretch.setting)
             elif name in self.declared:
-                total += self.declared[name].in_timing(self.setting) @ columns(stretch.setting)
-        return total
+                known += self.declared[name].in_timing(self.setting) @ pattern.columns(
+                    stretch.setting)
+        errors = of_measured(stretch, stretch.errors / self.data.unit - known)
+        return np.asarray(errors - np.polynomial.Polynomial.fit(place, errors, 1)(place))
 
     def _ripple(self) -> Array | None:
         """Return the ordinates of a motion that repeats with the revolution."""
@@ -374,14 +361,13 @@ class Chooser:
         """Return a clock and the fewest other patterns beside which its ticks make all errors."""
         clocks = {name for name, (item, _) in self.patterns.items() if item.replaces_jitter}
         others = sorted(self.patterns.keys() & EFFECTS.keys() - clocks)
-        if clocks:
-            for count in range(len(others) + 1):
-                for some in combinations(others, count):
-                    alone = frozenset(some)
-                    fit = self._on_ticks(alone)
-                    if fit is not None:
-                        self.fits[alone | clocks] = fit
-                        return alone | clocks
+        sets = (frozenset(some) for count in range(len(others) + 1)
+                for some in combinations(others, count))
+        for alone in sets if clocks else ():
+            fit = self._on_ticks(alone)
+            if fit is not None:
+                self.fits[alone | clocks] = fit
+                return alone | clocks
         return frozenset()
 
     def choice(self, best: frozenset[str]) -> Choice:
@@ -389,5 +375,4 @@ class Chooser:
         scores = {names: self.score(names, fit) for names, fit in self.fits.items()}
         possible = {names: fit for names, fit in self.fits.items()
                     if names == best or scores[names] > -math.inf}
-        return Choice(best, possible, {names: scores[names] for names in possible}, self.setting,
-                      tuple(self.declared.values()))
+        return Choice(best, possible, {names: scores[names] for names in possible}, self.setting)

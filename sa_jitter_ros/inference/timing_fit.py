@@ -69,7 +69,7 @@ class TimingFit:
     the declared jitter have any size. `fixed` are directions and densities of declared random
     errors, `declared_motion` (bin, 3, 3) what those of source and shaft make; `known`
     (ordinate, 3) are the declared patterns. `held` maps (name, number) to the value of
-    a parameter that stays.
+    a parameter that stays. The ordinates without all patterns are `left`, and in bins `power`.
     """
 
     def __init__(self, data: TimingData, spectra: Mapping[str, Spectrum],
@@ -141,8 +141,10 @@ class TimingFit:
         self.value = -np.inf
         for restart in count():  # a search that starts again where it ended goes on a little
             before = self.value
-            self.sizes, self.size_covariance, left = self._patterns(self.spectrum(self.parameters))
-            self.power = self.data.binned(left)
+            self.sizes, self.size_covariance = self._patterns(
+                self.data.made(self._densities(self.parameters)[0]))
+            self.left = self.ordinates - self.matrix @ self.sizes
+            self.power = self.data.binned(self.left)
             found = minimize(self._cost, self.parameters, method='L-BFGS-B', jac=True,
                              bounds=list(zip(self.lower, self.upper)))
             self.parameters, self.value = found.x, -float(found.fun)
@@ -194,9 +196,10 @@ class TimingFit:
             total[rows] += made
         return total, slopes
 
-    def spectrum(self, parameters: Array) -> Array:
+    @cached_property
+    def spectrum(self) -> Array:
         """Return what all components make of the three series together (bin, 3, 3)."""
-        return self.data.made(self._densities(parameters)[0])
+        return self.data.made(self._densities(self.parameters)[0])
 
     def _cost(self, parameters: Array) -> tuple[float, Array]:
         """Return minus the logarithm of likelihood and prior, and its slope."""
@@ -212,10 +215,10 @@ class TimingFit:
         slope = off @ self._stiff + slopes.reshape(parameters.size, -1) @ along.ravel()
         return float(value), slope
 
-    def _patterns(self, spectrum: Array) -> tuple[Array, Array, Array]:
-        """Return sizes of the patterns, their covariance, and the ordinates without them."""
+    def _patterns(self, spectrum: Array) -> tuple[Array, Array]:
+        """Return sizes of the patterns and their covariance."""
         if not self.columns:
-            return np.zeros(0), np.zeros((0, 0)), self.ordinates
+            return np.zeros(0), np.zeros((0, 0))
         inverse = np.linalg.inv(spectrum)[self.data.bin] * self.data.weight[:, None, None]
         weighted = np.einsum('fij,fjp->fip', inverse, self.matrix)
         normal = 2.0 * np.einsum('fip,fiq->pq', self.matrix.conj(), weighted).real
@@ -223,8 +226,7 @@ class TimingFit:
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         covariance = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-10) / np.outer(
             scale, scale)
-        sizes = covariance @ right
-        return sizes, covariance, self.ordinates - self.matrix @ sizes
+        return covariance @ right, covariance
 
     @cached_property
     def _changes(self) -> Array:
@@ -284,14 +286,9 @@ class TimingFit:
         return self.sizes[place], self.size_covariance[place, place]
 
     @cached_property
-    def left(self) -> Array:
-        """Return the ordinates (ordinate, 3) without the patterns."""
-        return np.asarray(self.ordinates - self.matrix @ self.sizes)
-
-    @cached_property
     def inverse(self) -> Array:
         """Return the inverse of the cross-spectrum (bin, 3, 3)."""
-        return np.asarray(np.linalg.inv(self.spectrum(self.parameters)))
+        return np.asarray(np.linalg.inv(self.spectrum))
 
     def beside_motion(self, alias: int) -> Array:
         """Return the inverse (bin, 3, 3) in which motion at one of `ALIASES` counts nothing."""
@@ -309,5 +306,5 @@ class TimingFit:
         """Return the power (bin,) in a direction over that of the fit; 1 where all is right."""
         steer = self.data.steer[direction][0]
         weight = inverse @ steer @ inverse
-        return np.asarray(np.einsum('fij,fji->f', weight, self.data.binned(self.left)).real
+        return np.asarray(np.einsum('fij,fji->f', weight, self.power).real
                           / np.einsum('fij,fji->f', inverse, steer).real)

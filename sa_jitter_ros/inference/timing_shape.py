@@ -22,7 +22,7 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.inference.residual import DRAWS
-from sa_jitter_ros.inference.timing_data import of_measured, Stretch, TimingData
+from sa_jitter_ros.inference.timing_data import TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from scipy.fft import irfft, rfft
@@ -41,13 +41,6 @@ def through(values: Array, gain: Array, data: TimingData) -> Array:
         np.arange(count // 2 + 1) / count, data.frequency, gain)
     transform[..., 0] = 0.0
     return np.asarray(irfft(transform, count))
-
-
-def errors_left(item: Stretch, unit: float, known: Array) -> Array:
-    """Return the errors (pulse,) that `known` ones and a trend leave, in units."""
-    errors = of_measured(item, item.errors / unit - known)
-    place = np.arange(errors.size)
-    return np.asarray(errors - np.polynomial.Polynomial.fit(place, errors, 1)(place))
 
 
 class Shapes:
@@ -70,7 +63,7 @@ class Shapes:
         `errors` (pulse,) of each stretch are in units; declared ones have the `power`.
         """
         data = fit.data
-        inverse = 1.0 / fit.spectrum(fit.parameters)[:, 1, 1].real
+        inverse = 1.0 / fit.spectrum[:, 1, 1].real
         mean = float(np.average(inverse, weights=data.size))
         rest = max(1.0 / mean - power, 0.0)
         total = 0.0
