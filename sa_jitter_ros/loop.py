@@ -30,6 +30,7 @@ from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.effects import declared_effects
 from sa_jitter_ros.errors import DataWarning, ModelError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
+from sa_jitter_ros.inference.record_pulses import SAME_RATIO
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.keyphasor_check.machine_file import on_target
@@ -46,7 +47,6 @@ Declared = str | os.PathLike[str] | DeclaredModel | Mapping[str, Any]
 
 _VERDICTS = ('none', 'traced', 'unexplained')
 _SHAFT = 'shaft'  # name of the only one
-_SAME_RATIO = 1e-5  # six digits, as people write them
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ def _for_several(recording: Recording, models: Mapping[str, DeclaredModel]) -> R
     """Return a recording without its ratio, which is that of one shaft only."""
     ratios = [model.ratio for model in models.values()]
     if recording.ratio != 1.0 and not any(
-            math.isclose(recording.ratio, ratio, rel_tol=_SAME_RATIO) for ratio in ratios):
+            math.isclose(recording.ratio, ratio, rel_tol=SAME_RATIO) for ratio in ratios):
         raise ModelError(f'the recording has the ratio {recording.ratio:.9g}, which none of the '
                          f'shafts {", ".join(models)} has: declare the ratios of this machine')
     return replace(recording, ratio=1.0)

@@ -32,7 +32,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 _BESIDE, _FEWEST = 24, 8
 # Standard deviations of the contrasts of a record from which on one is a step: drifts make 5.
 _CLEAR = 8.0
-_MOST = 50  # steps of a record
+
 _FINE = 10  # times that are tried, in a period of the highest order
 _EVEN = 0.995  # likelihoods, over the best one, that are as good: then the smallest step counts
 _CHUNK = 500  # cycles read at once
@@ -69,7 +69,7 @@ def clock_steps(reader: CycleReader, pulses: RecordPulses, stretches: Sequence[s
     for part in stretches:
         phasors = _Phasors.read(reader, pulses.bridged[part], model)
         edges = [0, phasors.count]
-        while len(found) < _MOST and (step := _clearest(phasors, edges)) is not None:
+        while (step := _clearest(phasors, edges)) is not None:
             at, size, error, period = step
             pulse = part.start + at + 1  # the step is inside cycle `at`
             found.append(ClockStep(pulse, float(np.mean(pulses.bridged[pulse - 1:pulse + 1])),
@@ -104,7 +104,7 @@ class _Phasors:
     Sums of the phasors of consecutive trigger cycles, over the root of their noise.
 
     `total` (cycle + 1, line) is that of all cycles before; `turns` (delay, line) are what the
-    `delays` (delay,) in s, shortest first, turn the lines of `frequency` (line,) in Hz by.
+    `delays` (delay,) in s turn the lines of `frequency` (line,) in Hz by.
     """
 
     total: Array
@@ -135,22 +135,20 @@ class _Phasors:
         step = 1.0 / (_FINE * float(frequency.max()))
         reach = math.floor(0.5 * model.trigger_period / step)
         delays = step * np.arange(-reach, reach + 1)
-        delays = delays[np.argsort(np.abs(delays), kind='stable')]
         turns = np.exp(-2j * np.pi * np.multiply.outer(delays, frequency))
         return cls(lines, frequency, delays, turns)
 
     def delay(self, before: tuple[int, int], after: tuple[int, int]) -> float:
         """Return by how much pulses of the cycles `after` are late against those `before`, s."""
+        if self.delays.size < 3:  # of a cycle that is short beside the lines
+            return 0.0
         both = self._both(before, after)
         likely = (self.turns @ both).real
-        best = int(np.argmax(likely > likely.max() - (1.0 - _EVEN) * np.abs(both).sum()))
-        near = np.argsort(np.abs(self.delays - self.delays[best]), kind='stable')[:3]
-        if near.size < 3:
-            return float(self.delays[best])
-        near = near[np.argsort(self.delays[near])]
-        low, middle, high = likely[near]
-        off = float(top_between(likely[near])) if low + high < 2.0 * middle else 0.0
-        return float(self.delays[near[1]] + off * (self.delays[near[1]] - self.delays[near[0]]))
+        good = np.flatnonzero(likely > likely.max() - (1.0 - _EVEN) * np.abs(both).sum())
+        best = min(max(int(good[np.argmin(np.abs(self.delays[good]))]), 1), likely.size - 2)
+        near = likely[best - 1:best + 2]
+        off = float(top_between(near)) if near[0] + near[2] < 2.0 * near[1] else 0.0
+        return float(self.delays[best] + off * (self.delays[best] - self.delays[best - 1]))
 
     def period(self, before: tuple[int, int], after: tuple[int, int]) -> float | None:
         """Return the shortest step in s, below a trigger cycle, that turns no line."""
@@ -166,8 +164,7 @@ class _Phasors:
     def likelihood(self, at: int, beside: int, delay: float) -> float:
         """Return how well a `delay` (s) in cycle `at` fits some cycles on either side."""
         likely = (self.turns @ self._both((at - beside, at), (at + 1, at + 1 + beside))).real
-        rising = np.argsort(self.delays)
-        return float(np.interp(delay, self.delays[rising], likely[rising]))
+        return float(np.interp(delay, self.delays, likely))
 
     def _both(self, before: tuple[int, int], after: tuple[int, int]) -> Array:
         early, late = (self.total[stop] - self.total[start] for start, stop in (before, after))

@@ -27,7 +27,8 @@ _SPEEDS = 0.05  # share of the cycles that are faster than the speeds of a run-u
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
-_SAME_RATIO = 1e-5  # relative; users give six digits
+#: Relative difference of ratios that are the same: users give six digits.
+SAME_RATIO = 1e-5
 _USUAL = 15  # pulses before a gap that tell how many it hides
 _COVERED = 0.5  # of the pulses, by those of a reference keyphasor
 
@@ -120,7 +121,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     Raises ModelError if the recording contradicts the declared model, RecordingError if it has no
     usable pulses.
     """
-    if abs(recording.ratio / model.ratio - 1.0) > _SAME_RATIO and recording.ratio != 1.0:
+    if abs(recording.ratio / model.ratio - 1.0) > SAME_RATIO and recording.ratio != 1.0:
         raise ModelError(f'ratio is declared as {model.ratio:.9g} but the recording says '
                          f'{recording.ratio:.9g}: declare the ratio of this machine')
     if recording.pulses_per_revolution not in (1, model.pulses_per_revolution):
