@@ -38,8 +38,8 @@ from sa_jitter_ros.commands import close_loop, loop_run
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.effects import declared_effects
 from sa_jitter_ros.errors import SaJitterError
-from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.residual import Residual, UNDEFINED
+from sa_jitter_ros.inference.scoring import make_bench
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.recordings import read, Recording
 

@@ -23,11 +23,11 @@ from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.lattice import placed_on_grid, ticks_leave_room, within_half_tick
 from sa_jitter_ros.inference.beat import find_beat, without_beat
-from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.expectation import Memory
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
 from sa_jitter_ros.inference.refinements import with_its_ticks
+from sa_jitter_ros.inference.scoring import make_bench
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording

@@ -78,8 +78,8 @@ def observed(model, count=1):
     missing = np.zeros(model.trigger_cycles, int)
     nothing = np.zeros((3, 3))
     cycles = np.tile(np.eye(3, dtype=complex), (2, 1, 1))
-    item = Acquisition(0, times, missing, times, 0.0 * times, 0.0 * times, cycles, cycles, nothing,
-                       nothing, np.zeros((0, 3, 3)), 0.0 * missing, 0.0, True, '')
+    item = Acquisition(0, times, missing, times, 0.0 * times, 0.0 * times, cycles[0], cycles,
+                       nothing, nothing, np.zeros((0, 3, 3)), 0.0 * missing, True, '')
     orders = np.array(model.orders)
     return Observation(model, count * (item,), orders, orders, ('a', 'b', 'c'),
                        RecordPulses.unbroken(times), model.sample_rate, False, model.trigger_speed)
@@ -180,7 +180,7 @@ def test_orders_beside_leak_as_late_as_the_corrected_pulses_are(rng):
     item = observed(model).acquisitions[0]
     heard = np.tile(amplitudes, (2, 1, 1))
     observation = replace(observed(model), orders=np.array([19.0]), sources=np.array(sources),
-                          acquisitions=(replace(item, raw_cycles=heard, cycles=heard),))
+                          acquisitions=(replace(item, raw=amplitudes, cycles=heard),))
     errors = 2e-4 * np.arange(cycles + 1.0) + rng.uniform(-1e-4, 1e-4, cycles + 1)
     clock = make_effect('keyphasor_quantisation', clock_rate=model.keyphasor_rate)
     signal = AveragedSignal(cycles, model.cycle_length, 19.0, sources, tuple(amplitudes))
@@ -202,7 +202,7 @@ def test_orders_beside_scatter_by_jitter_too(correlated, rng):
     item = observed(model).acquisitions[0]
     amplitudes = np.tile(np.array([[[1.0, 0.6, 0.5j]]]), (2, 1, 1))
     observation = replace(observed(model), orders=np.array([19.0]), sources=np.array(sources),
-                          acquisitions=(replace(item, raw_cycles=amplitudes, cycles=amplitudes),))
+                          acquisitions=(replace(item, raw=amplitudes[0], cycles=amplitudes),))
     effects = []
     errors = model.distribution.draw(rng, (draws, cycles + 1))
     if correlated:

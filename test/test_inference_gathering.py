@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
 from sa_jitter_ros.inference.gathering import (
-    _Grid, _of_acquisitions, _of_centred, _runs, _slope, _uncertainty, _unskewed, dithered)
+    _Grid, _of_centred, _runs, _slope, _uncertainty, _unskewed, dithered, of_acquisitions)
 from sa_jitter_ros.inference.observation import _in_parts
 
 PULSES, PERIOD, TICK, SKEW = 24, 0.025, 1e-4, 1e-3
@@ -37,7 +37,7 @@ def test_jitter_of_half_a_tick_makes_ticks_independent_errors(rng, jitter, uneve
              for first in range(0, count - PULSES + 1, PULSES)]
     observation = SimpleNamespace(
         model=SimpleNamespace(pulses_per_revolution=marks, pulses_per_trigger=1),
-        acquisitions=items, pulses=SimpleNamespace(number=np.arange(count)),
+        shown=items, pulses=SimpleNamespace(number=np.arange(count)),
         recoveries=[SimpleNamespace(roughness=0.05 * TICK)])
     assert dithered(observation, Clock(1.0 / TICK, 0.0), smooth_on_grid(times, 1.0 / TICK)
                     ) is expected
@@ -99,9 +99,9 @@ def test_skew_is_taken_out_though_the_smoothest_motion_drifts(rng):
     items = [SimpleNamespace(first=first, times=times[first:first + PULSES],
                              standard_errors=np.full(PULSES, 1e-3 * TICK))
              for first in range(0, count - 1, PULSES - 1)]
-    motion = _of_acquisitions(true + SKEW * times, items)
+    motion = of_acquisitions(true + SKEW * times, items)
     motion -= motion.mean(axis=1, keepdims=True)
-    left = _unskewed(items, motion, _Grid(1.0 / TICK, true - drift)) - _of_acquisitions(
+    left = _unskewed(items, motion, _Grid(1.0 / TICK, true - drift)) - of_acquisitions(
         true, items)
     slope = _slope(_runs(items, left))
     assert abs(slope) * np.ptp(times) < 0.05 * TICK

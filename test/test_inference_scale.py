@@ -16,10 +16,10 @@ import math
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.expectation import expect, Lines, Memory
 from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.inference.scoring import make_bench
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.inference.unsteady import SCATTER
 from sa_jitter_ros.prediction.influence import AveragePulses
@@ -62,7 +62,7 @@ def drifting(observation, size, rng):
     """Return an observation whose lines have different loads in each acquisition."""
     def changed(item):
         gain = 1.0 + size * rng.standard_normal(item.raw.shape)
-        return replace(item, raw_cycles=gain * item.raw_cycles, cycles=gain * item.cycles)
+        return replace(item, raw=gain * item.raw, cycles=gain * item.cycles)
     return replace(observation, acquisitions=tuple(map(changed, observation.acquisitions)))
 
 

@@ -65,7 +65,7 @@ def traces():
     found = {'none': traced(), 'traced': traced(excess_jitter={'std': 5e-5}),
              'geometry': traced(3, target_geometry={'pulse_angles': (0.0, 0.006, -0.004)}),
              'grid': traced(keyphasor_quantisation={'clock_rate': 4000.0, 'period_std': 2e-5})}
-    found['unexplained'] = replace(found['traced'], findings=(), verdict='unexplained',
+    found['unexplained'] = replace(found['traced'], findings=(), remains='a drift',
                                    after=found['traced'].before,
                                    prediction_after=found['traced'].prediction_before)
     found['blind'] = replace(found['unexplained'], evidence=None)
@@ -278,7 +278,7 @@ def test_sentence_of_other_verdicts(traces, verdict, says):
 
 
 def test_sentence_names_effects_that_do_not_suffice(traces):
-    content = report(replace(traces['traced'], verdict='unexplained'))
+    content = report(replace(traces['traced'], remains='a drift'))
     assert 'even with excess jitter the prediction' in verdict_sentence(content)
 
 
@@ -353,7 +353,7 @@ def test_declared_effects_belong_to_the_declared_model(traces):
     trace = traces['grid']
     (clock,) = trace.findings
     declared = replace(
-        trace, findings=(), verdict='none', evidence=replace(
+        trace, findings=(), evidence=replace(
             trace.evidence, explained=(clock.effect,), errors=trace.evidence.errors - np.array(
                 [item.errors - item.errors.mean() for item in trace.evidence.pulses])))
     for case, label in ((trace, 'with keyphasor_quantisation'), (declared, 'declared model')):

@@ -23,6 +23,8 @@ from sa_jitter_ros.pulses.resampling import margin
 
 #: Samples on either side of a cycle, for interpolation and corrected pulses.
 MARGIN = 40
+#: How samples are read between samples.
+METHOD = 'band_limited'
 
 
 @dataclass(frozen=True)
@@ -32,16 +34,15 @@ class CycleReader:
     samples: FloatArray
     start_time: float
     rate: float
-    method: str
 
     def inside(self, times: FloatArray) -> bool:
         """Whether the cycles between these pulses (s) are inside the samples."""
-        reach = margin(self.method) + 1
+        reach = margin(METHOD) + 1
         position = (times[[0, -1]] - self.start_time) * self.rate
         return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
 
     def cycles(self, pulses: FloatArray, *, law: AngleLaw = LINEAR_LAW,
-               ripple: FloatArray | None = None) -> CycleSamples:
+               ripple: FloatArray | float = 0.0) -> CycleSamples:
         """
         Return the trigger cycles between pulses.
 
@@ -50,7 +51,7 @@ class CycleReader:
         """
         return CycleSamples.cut(
             self.samples, start_time=self.start_time, rate=self.rate, pulses=pulses,
-            first=law.before, margin=MARGIN, ripple=0.0 if ripple is None else ripple,
+            first=law.before, margin=MARGIN, ripple=ripple,
             count=len(pulses) - 1 - law.before - law.after)
 
     def amplitudes(self, cycles: CycleSamples, model: DeclaredModel, orders: FloatArray,
@@ -58,7 +59,7 @@ class CycleReader:
         """Return what the averager makes of cycles from angle 0: (cycle, channel, order)."""
         return ShaftAverager(AverageSettings(
             cycle_length=model.cycle_length, trigger_cycles=cycles.count,
-            orders=tuple(orders.tolist()), angle_law=law.name, interpolation=self.method,
+            orders=tuple(orders.tolist()), angle_law=law.name, interpolation=METHOD,
             revolutions_per_trigger=model.trigger_revolutions)).amplitudes(cycles)
 
 

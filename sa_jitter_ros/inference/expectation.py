@@ -110,24 +110,19 @@ class Memory:
         self.shown: dict[tuple[tuple[Influence, ...], int], list[_Shown]] = {}
         #: Means and standard deviations of lines, by effects and acquisitions: they are small.
         self.predicted: dict[tuple[tuple[Influence, ...], tuple[int, ...]], tuple[Array, ...]] = {}
-        self._kept = 0
+        self._bytes: dict[int, int] = {}  # of arrays, each counted once
 
     def make_room(self) -> None:
         """Drop all predictions if they take too much."""
-        if self._kept > IN_MEMORY_BYTES:
+        if sum(self._bytes.values()) > IN_MEMORY_BYTES:
             self.shown.clear()
-            self._kept = 0
+            self._bytes.clear()
 
     def keep(self, key: tuple[tuple[Influence, ...], int], shown: list[_Shown]) -> None:
         """Keep what an acquisition shows."""
         self.shown[key] = shown
-        self._kept += sum(value.nbytes for item in shown for value in vars(item).values()
-                          if isinstance(value, np.ndarray))
-
-    def count(self, amplitudes: Amplitudes) -> None:
-        """Count the draws that are kept with these amplitudes."""
-        if amplitudes.draws is not None:
-            self._kept += amplitudes.draws.nbytes
+        self._bytes |= {id(value): value.nbytes for item in shown for value in (
+            *vars(item).values(), item.amplitudes.draws) if isinstance(value, np.ndarray)}
 
 
 @dataclass(frozen=True)
@@ -185,13 +180,15 @@ class Expectation:
 
     @cached_property
     def _bare(self) -> list[Distribution]:
-        return [item.distribution(np.arange(item.index.size), np.zeros(item.index.size),
-                                  self._most) for item in self.ungained]
+        return self._distributions(self.ungained, np.zeros(self.noise.size))
 
     @cached_property
     def _full(self) -> list[Distribution]:
-        return [item.distribution(np.arange(item.index.size), self.noise.ravel()[item.index],
-                                  self._most) for item in self.shown]
+        return self._distributions(self.shown, self.noise.ravel())
+
+    def _distributions(self, shown: Sequence[_Shown], noise: Array) -> list[Distribution]:
+        return [item.distribution(np.arange(item.index.size), noise[item.index], self._most)
+                for item in shown]
 
     @property
     def _most(self) -> int:
@@ -226,14 +223,16 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
             speed = _speed(observation.acquisitions[a], observation.model)
             alike.setdefault(speed, []).append(a)
     for speed, some in alike.items():
-        setting = _setting(observation, speed, effects)
+        model = replace(observation.model, trigger_speed=speed)
+        setting = _Setting(replace(observation, model=model), effects,
+                           random_processes(model, effects), component_gain(model, effects),
+                           line_variance(model, effects))
         found = iter(setting.shown([item for a in some for item in pulses[a]]))
         for a in some:
             memory.keep((key, a), [
                 _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
                 for i, _ in enumerate(pulses[a])])
-        for amplitudes in setting.made:
-            memory.count(amplitudes)
+
     shown = _together([[replace(item, index=item.index + n * lines.count)
                         for item in memory.shown[key, a]] for n, a in enumerate(chosen)])
     noise = np.zeros(len(chosen) * lines.count)
@@ -282,7 +281,6 @@ class _Setting:
     processes: tuple[AngleErrorProcess, ...]
     gain: Array
     noise: Array
-    made: list[Amplitudes] = field(default_factory=list)
 
     def shown(self, pulses: Sequence[AveragePulses]) -> list[_Source]:
         """Return the predicted amplitudes and leakage of unit components, for all `pulses`."""
@@ -326,7 +324,6 @@ class _Setting:
         doubt = IndependentPulseJitter(Normal(blur), weights=model.weights)
         unsure = (*unsure, doubt) if blur else unsure
         amplitudes = known_amplitudes(model, unsure, errors, gain=self.gain)
-        self.made.append(amplitudes)
         leakage = _leakage(self.observation, unsure, errors)
         shift = np.zeros_like(amplitudes.each.mean)
         if blur:
@@ -344,17 +341,9 @@ class _Setting:
     def _of_unknown_pulses(self) -> _Source:
         """Return what is predicted if nothing is known of the pulses: as `predict` does."""
         model = self.observation.model
-        amplitudes = unit_amplitudes(model, self.effects)
-        self.made.append(amplitudes)
         none = np.zeros((1, model.trigger_cycles + 1))
-        return _Source(amplitudes, None, _leakage(self.observation, self.processes, none)[0],
-                       np.zeros(len(model.orders)))
-
-
-def _setting(observation: Observation, speed: float, effects: Sequence[Influence]) -> _Setting:
-    model = replace(observation.model, trigger_speed=speed)
-    return _Setting(replace(observation, model=model), effects, random_processes(model, effects),
-                    component_gain(model, effects), line_variance(model, effects))
+        return _Source(unit_amplitudes(model, self.effects), None, _leakage(
+            self.observation, self.processes, none)[0], np.zeros(len(model.orders)))
 
 
 def _speed(item: Acquisition, model: DeclaredModel) -> float:

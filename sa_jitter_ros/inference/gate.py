@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.effect import effects_of, Finding
 
 #: Standard errors of a paired difference from which on it is one.
 CERTAIN = 2.0
@@ -118,12 +118,12 @@ def passed(findings: Sequence[Finding], predict: Callable[[Sequence[Finding]], H
     ``predict(findings)`` predicts with the declared model and these. The first to go is the one
     without which the held-out acquisitions are most likely.
     """
-    kept: list[Finding] = list(findings)
-    dropped: list[Finding] = []
-    declared = predict([]) if kept else None
-    while kept and declared is not None:
+    if not findings:
+        return [], [], NO_GAIN
+    kept, dropped, declared = list(findings), list[Finding](), predict([])
+    while kept:
         found = score_gain(declared, predict(kept), of_mean=any(
-            item.effect is not None and not item.effect.scatters for item in kept))
+            not effect.scatters for effect in effects_of(kept)))
         if not found.worse:
             return kept, dropped, found
         scores = [float(predict(kept[:i] + kept[i + 1:]).log_density.mean())

@@ -20,8 +20,8 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, ROOM, sizes_within_ticks, SLOPE_OFF, smooth_on_grid, ticks_leave_room,
-    within_half_tick)
+    Clock, find_clock, NO_CLOCK, ROOM, sizes_within_ticks, SLOPE_OFF, smooth_on_grid,
+    ticks_leave_room, within_half_tick)
 from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
@@ -53,8 +53,7 @@ def choose_lines(observation: Observation) -> Lines:
     They have at least 20 % of their order's strongest channel and a coherence from cycle to cycle
     of 0.9 times that of the best line, which noise and modulation lower too. There may be none.
     """
-    orders = observation.orders.size
-    cycles = cycle_amplitudes(observation)
+    orders, cycles = observation.orders.size, cycle_amplitudes(observation)
     level = np.abs(observation.stacked('corrected')[..., :orders]).mean(axis=0)
     with np.errstate(divide='ignore', invalid='ignore'):
         coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
@@ -103,16 +102,16 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     model, pulses = observation.model, observation.pulses
     clock, imposed = clock_of(observation)
     grid = None if imposed is None else _Grid(clock.rate, imposed)
-    again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
-    if grid is not None and group.max() > 0:
-        again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
-                 for i in range(int(group.max()) + 1)]
-    again = [None if motion is None or grid is None else _unskewed(
-        observation.acquisitions, motion, grid) for motion in again]
-    spread = [motion for motion in again if motion is not None]
-    error_std = [0.0 if motion is None or grid is None else _uncertainty(
-        observation, motion, spread, grid) for motion in again]
-    missed = (0.0, 0.0) if grid is None else _missed(observation, grid)
+    groups, missed = int(group.max()) + 1, (0.0, 0.0)
+    again: list[tuple[Array, float] | None] = [None] * groups
+    if grid is not None:
+        missed = _missed(observation, grid)
+        if groups > 1:
+            motions = [_unskewed(observation.acquisitions, recovered_again(
+                recording, observation, np.flatnonzero(group != i).tolist()), grid)
+                for i in range(groups)]
+            again = [(motion, _uncertainty(observation, motion, motions, grid))
+                     for motion in motions]
     known = []
     for a, item in enumerate(observation.acquisitions):
         start = item.first - model.weights.before
@@ -121,13 +120,13 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
         smooth = None if grid is None else grid.smooth[read]
         first = int(pulses.index[start])
         rows = []
-        for motion, uncertain in zip(again, error_std):
+        for better in again:
             errors, std, unknown = smooth, 0.0, missed
-            if smooth is not None and motion is not None and item.recovered and (
+            if smooth is not None and better is not None and item.recovered and (
                     item.standard_errors.mean() < 1.0 / math.sqrt(12.0) / clock.rate
-                    and np.all(np.isfinite(motion[a]))):
-                errors, std, unknown = smooth.copy(), uncertain, (0.0, 0.0)
-                errors[own] = within_half_tick(motion[a], clock.rate)
+                    and np.all(np.isfinite(better[0][a]))):
+                errors, std, unknown = smooth.copy(), better[1], (0.0, 0.0)
+                errors[own] = within_half_tick(better[0][a], clock.rate)
             rows.append(AveragePulses(pulses.times[read], first, errors,
                                       pulses.missing[read.start:read.stop - 1], std, *unknown))
         known.append(rows)
@@ -146,7 +145,7 @@ def clock_of(observation: Observation) -> tuple[Clock, Array | None]:
     times = observation.pulses.times
     clock = find_clock(times)
     if not clock.visible(observation.model.keyphasor_rate):
-        return Clock(0.0, 0.0), None
+        return NO_CLOCK, None
     smooth = smooth_on_grid(times, clock.rate)
     share = _confirmed(observation, smooth)
     unidentifiable = share < 1.0 - SLOPE_OFF and _independent(observation)
@@ -161,21 +160,21 @@ def _confirmed(observation: Observation, smooth: Array) -> float:
 
     It is 1 where the vibration shows no errors.
     """
-    usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
-    if not usable:
+    shown = observation.shown
+    if not shown:
         return 1.0
-    imposed = _straightened(_of_acquisitions(smooth, usable))
-    errors = _straightened(np.array([item.errors for item in usable]))
+    imposed = _straightened(of_acquisitions(smooth, shown))
+    errors = _straightened(np.array([item.errors for item in shown]))
     power = float(np.sum(imposed**2))
     return float(np.sum(imposed * errors) / power) if power else 1.0
 
 
 def _independent(observation: Observation) -> bool:
     """Return whether recovered errors are independent from pulse to pulse, as far as they tell."""
-    usable = [item.errors for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
-    if not usable or usable[0].size <= _LAGS + 1:
+    shown = observation.shown
+    if not shown or shown[0].errors.size <= _LAGS + 1:
         return False
-    errors = _straightened(np.array(usable))
+    errors = _straightened(np.array([item.errors for item in shown]))
     power = float(np.mean(errors**2))
     if not power > 0.0:
         return False
@@ -201,15 +200,13 @@ def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
     recovered one, which the ticks do not allow. What repeats with the marks is left in both.
     """
     marks, _ = own_marks(observation.model)
-    usable = [item for item in observation.acquisitions
-              if np.all(np.isfinite(item.errors)) and not np.any(item.missing)]
-    if not usable:
+    whole = [item for item in observation.shown if not np.any(item.missing)]
+    if not whole:
         return False
-    errors, imposed, times = (np.array(rows) for rows in (
-        [item.errors for item in usable],
-        [smooth[item.first:item.first + item.times.size] for item in usable],
-        [item.times for item in usable]))
-    place = (observation.pulses.number[[item.first for item in usable]][:, None]
+    errors, times = (np.array([getattr(item, name) for item in whole])
+                     for name in ('errors', 'times'))
+    imposed = of_acquisitions(smooth, whole)
+    place = (observation.pulses.number[[item.first for item in whole]][:, None]
              + np.arange(errors.shape[1])) % marks
     even = np.bincount(place.ravel(), errors.ravel(), marks) / np.maximum(
         np.bincount(place.ravel(), None, marks), 1)
@@ -219,16 +216,16 @@ def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
     return smoothest - max(recovered - float(noise), 0.0) > 6.0 * (ROOM / clock.rate) ** 2
 
 
-def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
+def gather(observation: Observation, chosen: Sequence[int],
            pulses: Sequence[Sequence[AveragePulses]], clock: Clock, effects: Sequence[Effect],
            scatter: LineEvidence) -> Evidence:
     """Return the evidence of the `chosen` acquisitions, less the contributions of `effects`."""
     model = observation.model
-    picked = [observation.acquisitions[a] for a in chosen]
-    usable = [a for a, item in zip(chosen, picked) if np.all(np.isfinite(item.errors))]
+    usable = [a for a in chosen if np.all(np.isfinite(observation.acquisitions[a].errors))]
+    items = [observation.acquisitions[a] for a in usable]
     errors, own = [], []
-    for a in usable:
-        item, read = observation.acquisitions[a], pulses[a][0]
+    for a, item in zip(usable, items):
+        read = pulses[a][0]
         if len(read.times) > item.times.size:
             read = read.without(model.weights.before, model.weights.after)
         own.append(read)
@@ -236,30 +233,24 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
         left = item.errors if known is None else item.errors - without_gaps(
             known, item.missing, item.times)
         errors.append(left - left.mean())
-    items = [observation.acquisitions[a] for a in usable]
     standard_errors = np.array([item.standard_errors for item in items])
     if observation.against_reference:
         standard_errors = np.zeros_like(standard_errors)
+    whole = scatter.with_sources
     return Evidence(
         model=model, pulses=tuple(own), errors=np.array(errors),
         standard_errors=standard_errors, ripple=np.array([item.ripple for item in items]),
         record_times=observation.pulses.times, record_missing=observation.pulses.lost,
-        clock=clock, explained=tuple(effects),
-        lines=replace(scatter, radial=scatter.radial[list(usable)],
-                      with_sources=None if scatter.with_sources is None else
-                      scatter.with_sources[list(usable)],
-                      noise_density=scatter.noise_density[list(usable)]))
+        clock=clock, explained=tuple(effects), lines=replace(
+            scatter, radial=scatter.radial[usable], noise_density=scatter.noise_density[usable],
+            with_sources=None if whole is None else whole[usable]))
 
 
 def pulse_evidence(observation: Observation) -> Evidence:
     """Return the evidence of the pulse times alone, without any acquisition."""
     none = np.zeros(0)
-    nothing, no_cycles = np.zeros((0, 0)), np.zeros((0, 0, 0))
-    return Evidence(
-        model=observation.model, pulses=(), errors=nothing, standard_errors=nothing,
-        ripple=nothing, record_times=observation.pulses.times,
-        record_missing=observation.pulses.lost, clock=Clock(0.0, 0.0),
-        lines=LineEvidence(none, none, none, nothing, no_cycles, none))
+    return gather(observation, (), (), NO_CLOCK, (), LineEvidence(
+        none, none, none, np.zeros((0, 0)), np.zeros((0, 0, 0)), none))
 
 
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
@@ -325,7 +316,7 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
     period = np.mean([np.ptp(item.true_times) / item.number[-1]
                       for item in observation.acquisitions])
     frequency = np.append(fit.orders * model.cycle_length / period, fit.tones)
-    amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
+    amplitudes = fit.amplitudes
     chosen = np.flatnonzero(~fit.synchronous)
     if not chosen.size:
         return None
@@ -390,15 +381,15 @@ def _missed(observation: Observation, grid: _Grid) -> tuple[float, float]:
 
     It is 0 where there are other errors beside those of the ticks.
     """
-    usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
-    if not usable:
+    shown = observation.shown
+    if not shown:
         return 0.0, 0.0
-    errors = _unskewed(usable, np.array([item.errors for item in usable]), grid)
+    errors = _unskewed(shown, np.array([item.errors for item in shown]), grid)
     error = 0.0 if observation.against_reference else float(np.sqrt(np.nanmean(
-        [item.standard_errors**2 for item in usable])))
+        [item.standard_errors**2 for item in shown])))
     if not ticks_leave_room(list(errors), float(np.nanmean(np.square(error))), grid.rate):
         return 0.0, 0.0
-    missed = errors - _of_acquisitions(grid.smooth, usable)
+    missed = errors - of_acquisitions(grid.smooth, shown)
     missed -= missed.mean(axis=1, keepdims=True)
     variance = float(np.mean(missed**2)) - error**2
     if variance <= 0.0:
@@ -427,7 +418,7 @@ def _of_centred(variance: float, together: float, count: int) -> tuple[float, fl
     return float(np.sqrt(variance / np.interp(correlation, tried, kept))), correlation
 
 
-def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
+def of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
     """Return (acquisition, pulse) of values of all pulses of a record."""
     return np.array([values[item.first:item.first + item.times.size] for item in items])
 
@@ -440,7 +431,7 @@ def _unskewed(items: Sequence[Acquisition], motion: Array, grid: _Grid) -> Array
     slopes that leave all errors within the ticks tell more.
     """
     times = np.array([item.times - item.times.mean() for item in items])
-    left = motion - _of_acquisitions(grid.smooth, items)
+    left = motion - of_acquisitions(grid.smooth, items)
     slopes = np.sum(times * (left - left.mean(axis=1, keepdims=True)), axis=1) / np.sum(
         times**2, axis=1)
     slopes = slopes[np.isfinite(slopes)]

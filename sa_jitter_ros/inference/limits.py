@@ -17,9 +17,10 @@ Limits: how large an effect that was not found could still be, at 95 %.
 Limits are one-sided. Of a random effect it is the power beside which the data show, all other
 parameters at their best, as little as a normal variable falls short by once in twenty times; of a
 pattern, whose sizes have either sign, it is the size of which estimates as small are as rare.
+An effect is undecided if, as large as its limit, it would still change an average.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 
@@ -33,13 +34,21 @@ from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import coarsest_clock
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
-from sa_jitter_ros.effects.timing import FAINT, Pattern, Spectrum
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.effects.timing import FAINT, Pattern
+from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.inference.candidates import Candidate
+from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
+from sa_jitter_ros.prediction.prediction import Prediction
 from scipy import special
 
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
+#: The largest change that an effect beside others makes.
+Change = Callable[[Sequence[Effect], Effect], float]
+# Shares of effects that are there, in the open half of the table of decisions; as many of those
+# that are named are not.
+_NOT_NAMED, _NOWHERE = 0.02, 7e-4
 
 
 @dataclass(frozen=True)
@@ -86,6 +95,51 @@ def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
     return tuple(rows)
 
 
+def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[EffectLimit]
+                      ) -> tuple[str, ...]:
+    """
+    Return the effects that, as large as their limits, would still change an average.
+
+    Random motions without a limit may be of any size.
+    """
+    found = []
+    for row in rows:
+        if row.effect is None:
+            kind = EFFECTS[row.name]
+            if row.lower is None and not issubclass(kind, DirectEffect) and not isinstance(
+                    kind.timing, Pattern):
+                found.append(row.name)
+            continue
+        try:
+            size = change(effects, row.effect)
+        except ModelError:  # so large that no average is left
+            size = math.inf
+        if size >= NOTICEABLE:
+            found.append(row.name)
+    return tuple(found)
+
+
+def published_change(before: Prediction, after: Prediction) -> float:
+    """Return the largest change of what is published: mean and scatter of an order."""
+    return float(max(np.abs(getattr(after, name) - getattr(before, name)).max()
+                     for name in ('mean_attenuation', 'standard_deviation')))
+
+
+def probabilities(candidates: Sequence[Candidate], timing: Timing | None, named: Iterable[str],
+                  not_testable: Collection[str]) -> Mapping[str, float]:
+    """
+    Return the probability that the declared model lacks an effect, of all that could be seen.
+
+    The odds among sets of effects hold if one of these sets is true. How often an effect is there
+    that was named, or that has these odds and was not named, is counted.
+    """
+    odds = {item.name: item.finding.probability for item in candidates}
+    odds |= timing.probabilities if timing is not None else {}
+    found = {name: _NOWHERE + _NOT_NAMED * value for name, value in odds.items()}
+    found |= dict.fromkeys(named, 1.0 - _NOT_NAMED)
+    return {name: value for name, value in found.items() if name not in not_testable}
+
+
 def _size(effect: Effect | None) -> float | None:
     if effect is None:
         return None
@@ -103,13 +157,11 @@ def largest(timing: Timing, name: str) -> Effect | None:
             return None
         sizes, covariance = chooser.fit(choice.best | {name}, choice.fit.starts).pattern(name)
         found, errors = _farthest(sizes, covariance), covariance
-    elif isinstance(kind.timing, Spectrum):
+    else:
         power = _bound(timing, name, ONE_SIDED)
         if power is None:
             return None
-        found, errors = power, np.zeros(len(kind.timing.upper))
-    else:
-        return None
+        found, errors = power, np.zeros(power.size)
     try:
         effect, _ = kind.of_timing(found, errors, choice.setting)
     except ParameterError:  # the data allow more than such an effect may be

@@ -16,7 +16,6 @@ change, and resonances that the speed crosses, turn lines each by itself, and ma
 follow the speed. No effect of the package does that.
 """
 
-from collections.abc import Iterator
 import math
 
 import numpy as np
@@ -108,11 +107,9 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
     """
     if not lines.count or not observation.recoveries:
         return ()
-    orders = observation.orders.size
-    amplitude = lines.of(observation.stacked('corrected')[..., :orders])
-    noise = np.sqrt(np.maximum(
-        np.mean(lines.of(observation.stacked('noise')[..., :orders]) ** 2, axis=0),
-        0.5 * variance[lines.order]))
+    amplitude = lines.of(observation.stacked('corrected'))
+    noise = np.sqrt(np.maximum(np.mean(lines.of(observation.stacked('noise')) ** 2, axis=0),
+                               0.5 * variance[lines.order]))
     order = observation.orders[lines.order]
     run, number = _runs(observation)
     turned = amplitude * np.exp(
@@ -168,16 +165,11 @@ def _accelerations(observation: Observation) -> Array:
 
 def _late(observation: Observation) -> Array:
     """Return by how much the pulses of each acquisition are late in the mean, in s."""
-    return np.array([float(np.nan_to_num(errors[item.number].mean()))
-                     for item, errors in zip(observation.acquisitions, _errors(observation))])
-
-
-def _errors(observation: Observation) -> Iterator[Array]:
-    """Yield the errors of the bridged pulses of each acquisition in s, their mean included."""
+    late = []
     for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
-        recovery = observation.recoveries[recording]
-        start = int(recovery.pulses.number[item.first])
-        yield recovery.bridged_errors[start:start + item.bridged.size]
+        errors = observation.recoveries[recording].errors
+        late.append(float(np.nan_to_num(errors[item.first:item.first + item.times.size].mean())))
+    return np.array(late)
 
 
 def _turns(observation: Observation, ratio: Array, noise: Array, order: Array, freedom: int

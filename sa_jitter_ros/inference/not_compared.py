@@ -18,21 +18,20 @@ import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import DirectEffect, effects_of, Finding
 from sa_jitter_ros.effects.lattice import NO_CLOCK
-from sa_jitter_ros.inference.benches import few_of, parted
 from sa_jitter_ros.inference.candidates import Candidate, candidates_of_lines
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.gate import NO_GAIN, passed
 from sa_jitter_ros.inference.gathering import choose_lines, pulse_evidence
-from sa_jitter_ros.inference.limits import limits
+from sa_jitter_ros.inference.limits import (
+    limits, probabilities, published_change, undecided_effects)
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.refinements import with_its_noise
 from sa_jitter_ros.inference.remainder import (
     _GAIN, predicting, single_events, unexplained_text, without_harmful)
 from sa_jitter_ros.inference.residual import UNDEFINED
-from sa_jitter_ros.inference.scoring import Bench
+from sa_jitter_ros.inference.scoring import Bench, parted
 from sa_jitter_ros.inference.timing import read_timing, stretches
 from sa_jitter_ros.inference.trace_result import Trace
-from sa_jitter_ros.inference.undecided import probabilities, published_change, undecided_effects
 from sa_jitter_ros.inference.unsteady import UnsteadyLine
 from sa_jitter_ros.prediction.prediction import predict, Prediction
 
@@ -78,7 +77,7 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     else:
         bench, noise = with_its_noise(bench)
         evidence = bench.gather((), range(count))
-        by_how_much = partial(bench.change, chosen=few_of(bench))
+        by_how_much = partial(bench.change, chosen=bench.few)
         tried = candidates_of_lines(bench, ())
         found = [item.finding for item in tried if not item.rejected_because]
         events = single_events(bench, found)
@@ -99,9 +98,8 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
         tuple(present), tuple(without_harmful(tried, harmful)), UNDEFINED, UNDEFINED,
-        np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None,
-        'unexplained' if left_over else 'traced' if found else 'none', float('nan'),
-        None, None, rows, tuple(row.name for row in rows if row.name in undecided),
+        np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None, float('nan'), rows,
+        tuple(row.name for row in rows if row.name in undecided),
         probabilities(tried, None, names, not_testable), reason, noise, gain=gained,
         remains=left_over, unsteady=unsteady, not_testable=not_testable,
         clock=NO_CLOCK if bench is None else bench.clock)

@@ -33,20 +33,19 @@ from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.clock_steps import broken_at_steps, clock_steps, ClockStep
-from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
+from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN, METHOD
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)
 from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.prediction.influence import common_turn, mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
+from sa_jitter_ros.pulses.angle_law import angle_law, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import FULL_BAND
 from sa_jitter_ros.recordings.channel_check import stuck
 from sa_jitter_ros.recordings.limits import MAX_VALUES
 from sa_jitter_ros.recordings.recording import Recording
 
-Progress = Callable[[float], None]
 NameOf = Callable[[float], str]  # of an order
 
 #: Coherence of a line from cycle to cycle, in units of that of noise, from which on it is used.
@@ -72,8 +71,8 @@ class Acquisition:
     `times`, `errors` and `standard_errors` (N_t + 1,) in s are those of its measured pulses;
     errors are measured minus true times with mean 0, NaN where nothing was recovered. `missing`
     (N_t,) is the number of missing pulses in each cycle; `bridged` are the times with these
-    interpolated. `raw` and `corrected` (channel, order) are complex peak amplitudes; `raw_cycles`
-    and `cycles` (cycle, channel, order) those of single cycles. `noise` (channel, order) is the
+    interpolated. `raw` and `corrected` (channel, order) are complex peak amplitudes, `cycles`
+    (cycle, channel, order) the corrected ones of single cycles. `noise` (channel, order) is the
     standard deviation of an amplitude along its radius, `noise_floor` the part of it that the
     spectrum around the order shows. `parts` (part, channel, order) are the amplitudes of declared
     orders in equal parts of the cycles, less the other ones. `ripple` (cycle,) is the factor of
@@ -88,13 +87,12 @@ class Acquisition:
     bridged: FloatArray
     errors: FloatArray
     standard_errors: FloatArray
-    raw_cycles: ComplexArray
+    raw: ComplexArray
     cycles: ComplexArray
     noise: FloatArray
     noise_floor: FloatArray
     parts: FloatArray
     ripple: FloatArray
-    ripple_standard_error: float
     recovered: bool
     reason: str
 
@@ -117,11 +115,6 @@ class Acquisition:
     def period(self) -> float:
         """Return the mean trigger period in s."""
         return mean_period(self.times, self.missing)
-
-    @cached_property
-    def raw(self) -> ComplexArray:
-        """Return the raw complex peak amplitudes (channel, order)."""
-        return np.asarray(self.raw_cycles.mean(axis=0))
 
     @cached_property
     def corrected(self) -> ComplexArray:
@@ -173,6 +166,11 @@ class Observation:
         return order_words(order, self.name_of(order))
 
     @property
+    def shown(self) -> list[Acquisition]:
+        """Return the acquisitions whose pulse errors the vibration shows."""
+        return [item for item in self.acquisitions if np.all(np.isfinite(item.errors))]
+
+    @property
     def compared(self) -> tuple[int, ...]:
         """Return the acquisitions whose attenuation is known."""
         return tuple(a for a, item in enumerate(self.acquisitions)
@@ -194,9 +192,8 @@ class Observation:
         return np.array([getattr(item, field) for item in self.acquisitions])
 
 
-def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 'band_limited',
-            sources: Sequence[float] = (), name_of: NameOf = nameless,
-            progress: Progress | None = None) -> Observation:
+def observe(recording: Recording, model: DeclaredModel, *, sources: Sequence[float] = (),
+            name_of: NameOf = nameless) -> Observation:
     """
     Observe the acquisitions of a recording.
 
@@ -221,8 +218,8 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     model = replace(model, sample_rate=recording.sample_rate, orders=once, trigger_speed=speed)
     samples, gaps = _read(recording)
     pulses = pulses.broken_at(gaps, recording.start_time, recording.sample_rate, MARGIN)
-    reader = CycleReader(samples, recording.start_time, recording.sample_rate, interpolation)
-    starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
+    reader = CycleReader(samples, recording.start_time, recording.sample_rate)
+    starts = _starts(pulses, reader, model)
     if not starts:
         raise RecordingError(
             f'{pulses.times.size} trigger pulses do not make an acquisition of '
@@ -235,7 +232,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
         pulses = broken_at_steps(pulses, steps)
         recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses,
                                   model)
-        starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
+        starts = _starts(pulses, reader, model)
         if not starts:
             raise RecordingError(
                 f'the clock steps {len(steps)} times, first at {steps[0].time:.6g} s by '
@@ -244,12 +241,10 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     orders = np.array(sources if len(sources) else [*once, *leaking_orders(recovery, model)])
     bare = replace(pulses, reference=None)
     found, referenced = [], []
-    for count, first in enumerate(starts):
+    for first in starts:
         found.append(_acquire(reader, bare, recovery, model, first, orders))
         if pulses.reference is not None:
             referenced.append(_acquire(reader, pulses, recovery, model, first, orders))
-        if progress is not None:
-            progress((count + 1) / len(starts))
     if referenced:
         reason = _fails_as_reference(referenced, found, len(once))
         pulses = replace(bare, remarks=(
@@ -268,6 +263,8 @@ def together(observations: Sequence[Observation]) -> Observation:
     Raises ModelError for recordings of different machines: channels, rate or amplitudes differ.
     """
     first = observations[0]
+    if len(observations) == 1:
+        return first
     level = np.abs(first.stacked('corrected')).mean(axis=0)
     for other in observations[1:]:
         same = (other.sample_rate == first.sample_rate
@@ -293,8 +290,6 @@ def together(observations: Sequence[Observation]) -> Observation:
             item.pulses.starts_run[1:] for item in observations[1:])]),
         remarks=tuple(f'{item.name or "a recording"}: {remark}' for item in observations
                       for remark in item.pulses.remarks))
-    if len(observations) == 1:
-        return first
     speed = np.average([item.model.trigger_speed for item in observations],
                        weights=[len(item.acquisitions) for item in observations])
     return replace(first, model=replace(first.model, trigger_speed=float(speed)), pulses=pulses,
@@ -329,9 +324,10 @@ def _read(recording: Recording) -> tuple[FloatArray, BoolArray]:
     return samples, gaps
 
 
-def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:
+def _starts(pulses: RecordPulses, reader: CycleReader, model: DeclaredModel) -> list[int]:
     """Return the first pulse of every acquisition with valid pulses and gapless vibration."""
-    times, number = pulses.times, pulses.number
+    times, number, cycles = pulses.times, pulses.number, model.trigger_cycles
+    law = angle_law(model.angle_law)
     found, first = [], law.before
     while first + cycles + law.after < times.size:
         part = slice(first, first + cycles + 1)
@@ -404,21 +400,22 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         corrected_pulses = better + errors.mean() * common_turn(better, law.before + measured)
     errors = errors - errors.mean()
     corrects_ripple = pulses.reference is None and resolved and not reason
-    corrected_ripple = ripple if corrects_ripple else None
     raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
-    cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
-    clean_cycles = _clean(reader.amplitudes(cycles, model, sources, corrected_law), model, sources)
-    grid = cycle_grid([cycles], method=reader.method, law=corrected_law,
+    cycles = reader.cycles(corrected_pulses, law=corrected_law,
+                           ripple=ripple if corrects_ripple else 0.0)
+    clean_cycles = without_leakage(
+        reader.amplitudes(cycles, model, sources, corrected_law), tuple(sources.tolist()),
+        model.cycle_length, model.cycle_length * np.arange(cycles.count))
+    grid = cycle_grid([cycles], method=METHOD, law=corrected_law,
                       period=float(np.diff(bridged).max()))
     declared = sources[:len(model.orders)]
     floor = noise_floor(grid, model.cycle_length, declared,
                         FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
-        first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
+        first, times, missing, bridged, errors, standard_errors, raw.mean(axis=0), clean_cycles,
         radial_noise(clean_cycles), floor, _in_parts(
             grid, clean_cycles[..., :len(declared)], model.cycle_length * declared),
-        np.where(missing > 0, np.nan, ripple[measured[:-1]]), recovery.ripple_standard_error,
-        not reason, reason)
+        np.where(missing > 0, np.nan, ripple[measured[:-1]]), not reason, reason)
 
 
 def _in_parts(grid: FloatArray, cycles: ComplexArray, turns: FloatArray) -> FloatArray:
@@ -434,12 +431,6 @@ def _in_parts(grid: FloatArray, cycles: ComplexArray, turns: FloatArray) -> Floa
     means = np.stack(left, axis=-1) / np.diff([*begins, points])[:, None, None]
     unit = np.exp(-1j * np.angle(own))[:, None]
     return np.asarray(((own[:, None] + means) * unit).real).reshape(-1, *cycles.shape[1:])
-
-
-def _clean(cycles: ComplexArray, model: DeclaredModel, sources: FloatArray) -> ComplexArray:
-    """Return the amplitudes of cycles (cycle, channel, order) without what the orders leak."""
-    return without_leakage(cycles, tuple(sources.tolist()), model.cycle_length,
-                           model.cycle_length * np.arange(len(cycles)))
 
 
 def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: RecordRecovery,

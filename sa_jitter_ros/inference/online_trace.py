@@ -16,9 +16,8 @@ pulse errors without the ripple between pulses. Effects that show only there are
 off line.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-import math
 from typing import ClassVar
 
 import numpy as np
@@ -28,7 +27,7 @@ from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
-from sa_jitter_ros.inference.gathering import clock_of
+from sa_jitter_ros.inference.gathering import clock_of, of_acquisitions
 from sa_jitter_ros.inference.observation import Acquisition, nameless, NameOf, Observation
 from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
@@ -65,8 +64,7 @@ class MeasuredNoise(Effect):
 
 
 def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
-                   declared: Sequence[Effect] = (), name_of: NameOf = nameless,
-                   progress: Callable[[str], None] | None = None) -> Trace:
+                   declared: Sequence[Effect] = (), name_of: NameOf = nameless) -> Trace:
     """
     Trace the residual of averages, those of the longest stretch without a gap.
 
@@ -78,15 +76,15 @@ def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
     require_acquisitions(observation)
     lines = Lines(*np.nonzero(
         good_lines(stretch, places(observation.orders, stretch[0].orders))))
-    count = len(stretch)
-    fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
+    every = range(len(stretch))
+    fit, held_out = tuple(every[::2]), tuple(every[1::2])
     clock, pulses = _pulses(observation)
     level = lines.of(np.abs(observation.stacked('corrected'))[list(fit)].mean(axis=0))
     bench = Bench(
         observation, lines, level, pulses, clock, np.ones(len(stretch[0].raw), int),
         _scatter(observation, lines, level), fit, held_out,
         (*declared, _measured_noise(observation, lines)), ONLY_OFF_LINE)
-    found = trace_bench(bench, timing_of(bench), progress=progress)
+    found = trace_bench(bench, timing_of(bench))
     return replace(found, declared=tuple(declared), findings=tuple(
         replace(item, deciding_measurement=_DECISIVE,
                 indistinguishable_from=(*item.indistinguishable_from, 'speed_fluctuation'))
@@ -95,16 +93,13 @@ def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
 
 def _longest_stretch(averages: Sequence[ReceivedAverage]) -> Sequence[ReceivedAverage]:
     """Return the longest run of averages with pulse errors, each beginning where one ended."""
-    best: list[ReceivedAverage] = []
-    run: list[ReceivedAverage] = []
+    runs: list[list[ReceivedAverage]] = [[]]
     for item in averages:
-        if item.pulses is None:
-            run = []
-            continue
-        if run and abs(item.start_time - run[-1].end_time) > 1e-6:
-            run = []
-        run.append(item)
-        best = list(run) if len(run) > len(best) else best
+        if runs[-1] and (item.pulses is None
+                         or abs(item.start_time - runs[-1][-1].end_time) > 1e-6):
+            runs.append([])
+        runs[-1] += [item] if item.pulses is not None else []
+    best = max(runs, key=len)
     if not best:
         raise SignalError('the averages have no pulse errors: set correct_jitter: true in the '
                           'averager')
@@ -128,11 +123,10 @@ def _observation(averages: Sequence[ReceivedAverage], model: DeclaredModel) -> O
         found.append(Acquisition(
             first=number * count, times=when, missing=np.zeros(count, np.int64),
             bridged=when, errors=errors - errors.mean(), standard_errors=error,
-            raw_cycles=item.raw[None][:, :, kept], cycles=item.corrected[None][:, :, kept],
+            raw=item.raw[:, kept], cycles=item.corrected[None][:, :, kept],
             noise=item.noise[:, kept], noise_floor=item.noise[:, kept],
             parts=np.zeros((0, *item.noise[:, kept].shape)),
-            ripple=np.full(count, np.nan), ripple_standard_error=math.inf, recovered=True,
-            reason=''))
+            ripple=np.full(count, np.nan), recovered=True, reason=''))
     speed = float(np.mean([item.trigger_speed for item in averages]))
     orders = measured[kept]
     record = np.concatenate(times)
@@ -156,7 +150,7 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[AveragePulses]]]
     if smooth is None:
         return clock, [
             2 * [AveragePulses(item.times, item.first, None, item.missing)] for item in items]
-    grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
+    grid = of_acquisitions(smooth, items)
     recovered = np.asarray(observation.stacked('errors'))
     variance = float(np.mean(np.square(observation.stacked('standard_errors'))))
     better = recovered if ticks_leave_room(list(recovered), variance, clock.rate) else grid

@@ -50,14 +50,14 @@ class RecordFit:
     are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
     `bend_standard_errors` (2,) their standard errors, infinite where the vibration tells nothing
     of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
-    lines; `amplitudes` (channel, order) and `tone_amplitudes` (channel, tone) complex peak
-    amplitudes; `amplitude_errors` (channel, order + tone) the standard errors of their real and
-    imaginary parts. `synchronous` (line,) tells which orders, and tones after them, turn with the
-    shafts: orders that shafts must have, those that a varying speed shows to turn, and sidebands
-    of several lines. `jitter_std` (s) is the estimated size of the pulse errors; `expected_std`
-    (3,) in s are the sizes of errors and bends that the fit expected, towards 0, the errors
-    towards a line that grows by `trend` s in a second. Declared lines that stand out of the noise
-    have `held` the angle to the pulses: others go along with any drift.
+    lines; `amplitudes` (channel, line) complex peak amplitudes of orders, and tones after them;
+    `amplitude_errors` (channel, line) the standard errors of their real and imaginary parts.
+    `synchronous` (line,) tells which of them turn with the shafts: orders that shafts must have,
+    those that a varying speed shows to turn, and sidebands of several lines. `jitter_std` (s) is
+    the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
+    bends that the fit expected, towards 0, the errors towards a line that grows by `trend` s in a
+    second. Declared lines that stand out of the noise have `held` the angle to the pulses: others
+    go along with any drift.
     """
 
     errors: Array
@@ -69,7 +69,6 @@ class RecordFit:
     orders: Array
     tones: Array
     amplitudes: ComplexArray
-    tone_amplitudes: ComplexArray
     amplitude_errors: Array
     synchronous: BoolArray
     jitter_std: float
@@ -174,9 +173,8 @@ def _result(states: States, false_alarm: float) -> RecordFit:
     shown = (np.abs(states.amplitudes) ** 2 / variances)[:, :states.declared]
     return RecordFit(
         errors, np.sqrt(states.variances(0)), _roughness(states), bends, bend_errors,
-        states.declared, states.orders, states.tones, states.amplitudes[:, :states.orders.size],
-        states.amplitudes[:, states.orders.size:],
-        np.sqrt(variances), states.synchronous,
+        states.declared, states.orders, states.tones, states.amplitudes, np.sqrt(variances),
+        states.synchronous,
         float(states.size[0]), states.size[:3] * np.array([weak, 1.0, 1.0]), states.trend,
         bool(gammaincc(shown.size, 0.5 * shown.sum()) < false_alarm))
 

@@ -87,10 +87,11 @@ class RecordRecovery:
     @property
     def size(self) -> float:
         """Return the size of the errors (s): that of the fit, or what exceeds their noise."""
-        known = np.isfinite(self.standard_errors)
+        errors, noise = self.errors, self.standard_errors
+        known = np.isfinite(noise)
         if not known.any():
             return self.jitter_std
-        power = float(np.var(self.errors[known]) - np.mean(self.standard_errors[known] ** 2))
+        power = float(np.var(errors[known]) - np.mean(noise[known] ** 2))
         return max(self.jitter_std, float(np.sqrt(max(power, 0.0))))
 
     @property
@@ -144,7 +145,8 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     if not recovery.resolved and ends(_WIDER) != ends(wider):
         found = _joined(pulses, stretches, fits(known, _WIDER))
         if found.resolved:  # orders that shafts must have tell how long the cycles are
-            lines = _made_exact(found.undeclared[0], model), found.undeclared[1]
+            orders, tones = found.undeclared
+            lines = np.array([_exact(order, model) for order in orders.tolist()]), tones
             wider, recovery = _WIDER, _joined(pulses, stretches, fits(lines, _WIDER))
     if known is None and any(item.size for item in recovery.undeclared):
         roughness = _roughness(recovery)
@@ -236,25 +238,26 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
         if fit is not None:
             errors[stretch], standard_errors[stretch] = fit.errors, fit.standard_errors
             ripple[stretch.start:stretch.stop - 1] = fit.bends[:, 0]
-    ripple_error = float(np.sqrt(np.mean([fit.bend_standard_errors[0] ** 2 for fit in good]))
-                         ) if good else np.inf
+    if not good:
+        none = np.zeros(0)
+        return RecordRecovery(pulses, errors, standard_errors, ripple, np.inf, 0.0, 0.0,
+                              (none, none), (), (), np.zeros(3))
+    ripple_error = float(np.sqrt(np.mean([fit.bend_standard_errors[0] ** 2 for fit in good])))
     if not np.isfinite(ripple_error):
         ripple[:] = np.nan
     weights = [fit.errors.size for fit in good]
-
-    def mean(values: Sequence[FloatArray]) -> FloatArray:
-        return np.asarray(np.average(values, axis=0, weights=weights))
-
-    empty = np.zeros(0)
-    longest = max(good, key=lambda fit: fit.errors.size, default=None)
+    roughness, jitter_std, expected_std = (
+        np.sqrt(np.average([np.square(getattr(fit, name)) for fit in good], 0, weights))
+        for name in ('roughness', 'jitter_std', 'expected_std'))
+    longest = _longest(good)
     return RecordRecovery(
-        pulses, errors, standard_errors, ripple, ripple_error,
-        float(np.sqrt(mean([np.square(fit.roughness) for fit in good]))) if good else 0.0,
-        float(np.sqrt(mean([np.square(fit.jitter_std) for fit in good]))) if good else 0.0,
-        (empty, empty) if longest is None else (
-            longest.orders[longest.declared:], longest.tones), tuple(good),
-        tuple(part for part, fit in zip(stretches, fits) if fit is not None),
-        np.sqrt(mean([fit.expected_std**2 for fit in good])) if good else np.zeros(3))
+        pulses, errors, standard_errors, ripple, ripple_error, float(roughness),
+        float(jitter_std), (longest.orders[longest.declared:], longest.tones), tuple(good),
+        tuple(part for part, fit in zip(stretches, fits) if fit is not None), expected_std)
+
+
+def _longest(fits: Sequence[RecordFit]) -> RecordFit:
+    return max(fits, key=lambda item: item.errors.size)
 
 
 def _roughness(recovery: RecordRecovery) -> float:
@@ -278,10 +281,10 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     """
     if not recovery.fits:
         return []
-    fit = max(recovery.fits, key=lambda item: item.errors.size)
+    fit = _longest(recovery.fits)
     declared = fit.declared
-    level = np.abs(fit.amplitudes[:, :declared]).max(axis=1, keepdims=True)
-    share = np.max(np.abs(fit.amplitudes) / level, axis=0)
+    height = np.abs(fit.amplitudes[:, :fit.orders.size])
+    share = np.max(height / height[:, :declared].max(axis=1, keepdims=True), axis=0)
     # a trigger cycle that missing pulses make longer reads these as the declared ones
     longer = 1 + np.unique(recovery.pulses.missing[recovery.pulses.missing > 0])
     read = np.divide.outer(np.array(model.orders), longer)
@@ -292,24 +295,17 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     for i in np.lexsort((-share, ~near)).tolist():
         if i < declared or share[i] < ACCURACY or len(found) == _MOST:
             continue
-        exact = _exact(float(fit.orders[i]), model)
-        order = float(fit.orders[i]) if exact is None else exact
+        order = _exact(float(fit.orders[i]), model)
         wanted = order == round(order) or fit.synchronous[i]
         if wanted and np.abs(np.subtract((*model.orders, *found), order)).min() > resolved:
             found.append(order)
     return found
 
 
-def _made_exact(orders: FloatArray, model: DeclaredModel) -> FloatArray:
-    """Return orders, those that shafts must have without the error of the fit."""
-    exact = [_exact(order, model) for order in orders.tolist()]
-    return np.array([order if own is None else own for order, own in zip(orders.tolist(), exact)])
-
-
-def _exact(order: float, model: DeclaredModel) -> float | None:
-    """Return the line of the trigger cycle, or the whole order, that an order is; or None."""
+def _exact(order: float, model: DeclaredModel) -> float:
+    """Return the line of the trigger cycle, or the whole order, that an order is; else itself."""
     near = _ON_LINE / (model.trigger_cycles * model.cycle_length)
     for exact in (round(order * model.cycle_length) / model.cycle_length, float(round(order))):
         if abs(order - exact) < near:
             return exact
-    return None
+    return order

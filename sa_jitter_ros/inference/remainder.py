@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from sa_jitter_ros.effects.effect import effects_of, Finding
+from sa_jitter_ros.effects.effect import Effect, effects_of, Finding
 from sa_jitter_ros.effects.timing import Pattern, PULSES
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.clock_steps import steps_text
@@ -71,7 +71,12 @@ def without_absorbing(scores: Scores, left: Check | None, chosen: list[Finding],
     of_lines = _SCATTER if left is None and scores.after.p_amplitude < FALSE_ALARM else ''
     if not (of_timing or of_lines):
         return chosen, candidates
-    return _beyond_doubt(chosen, candidates, of_timing, of_lines)
+    kept = [finding for finding in chosen if finding.effect is not None and not (
+        (of_lines and finding.effect.scatters) or (of_timing and _absorbs(finding.effect)))]
+    names = {finding.name for finding in kept}
+    return kept, [item if item.rejected_because or item.name in names else replace(
+        item, rejected_because='it absorbs a part of what no effect explains: '
+        + (of_timing or of_lines)) for item in candidates]
 
 
 def _little_is_gained(chosen: Sequence[Finding], before: Residual, after: Residual) -> str:
@@ -82,22 +87,10 @@ def _little_is_gained(chosen: Sequence[Finding], before: Residual, after: Residu
     return _MOST_LEFT if on_the_mean and after.rms > 0.5 * before.rms else ''
 
 
-def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], of_timing: str,
-                  of_lines: str) -> tuple[list[Finding], list[Candidate]]:
-    """Return the effects that do not merely absorb a part of what is left, and the candidates."""
-    kept = [finding for finding in chosen if finding.effect is not None and not (
-        (of_lines and finding.effect.scatters) or (of_timing and _absorbs(finding)))]
-    names = {finding.name for finding in kept}
-    return kept, [item if item.rejected_because or item.name in names else replace(
-        item, rejected_because='it absorbs a part of what no effect explains: '
-        + (of_timing or of_lines)) for item in candidates]
-
-
-def _absorbs(finding: Finding) -> bool:
+def _absorbs(effect: Effect) -> bool:
     """Return whether an effect may absorb a part of what is none of it."""
-    effect = finding.effect
-    return effect is not None and (effect.random or (
-        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times))
+    return effect.random or (
+        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times)
 
 
 def unexplained_check(bench: Bench, timing: Timing | None, chosen: Sequence[Finding]

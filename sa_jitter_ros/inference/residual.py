@@ -123,11 +123,7 @@ def _one_of_three(*p_values: float) -> float:
 
 
 #: The residual of no line.
-UNDEFINED = Residual(
-    mean=np.zeros(0), standard_error=np.zeros(0), rms=_NAN, rms_standard_error=_NAN,
-    rms_parameter_error=_NAN, chi2_per_dof=_NAN, ks=_NAN, cramer_von_mises=_NAN, coverage=_NAN,
-    p_value=_NAN, p_mean=_NAN, p_scatter=_NAN, p_amplitude_scatter=_NAN, score=_NAN,
-    amplitude_score=_NAN, z=np.zeros((0, 0)))
+UNDEFINED = Residual(np.zeros(0), np.zeros(0), *13 * (_NAN,), z=np.zeros((0, 0)))
 
 
 def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Array,
@@ -157,7 +153,7 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
         rms_standard_error=float(np.sqrt(np.mean(error**2))),
         rms_parameter_error=float(np.sqrt(np.mean(unsure))),
         chi2_per_dof=float(np.mean(z**2)),
-        ks=ks, cramer_von_mises=cramer_von_mises if inside.size > 1 else float('nan'),
+        ks=ks, cramer_von_mises=cramer_von_mises if inside.size > 1 else _NAN,
         coverage=float(np.mean((inside > 0.025) & (inside < 0.975))),
         p_value=_rms_p_value(difference, scale, [item.mean for item in sensitivities]),
         p_mean=_mean_p_value(difference / scale, scale, [item.mean for item in sensitivities]),

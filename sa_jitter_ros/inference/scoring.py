@@ -17,24 +17,29 @@ the scatter that noise, jitter and effects predict.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.effect import Finding, possible
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
-from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
+from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memory
 from sa_jitter_ros.inference.gate import HeldOut
-from sa_jitter_ros.inference.gathering import gather
+from sa_jitter_ros.inference.gathering import (
+    channel_groups, choose_lines, gather, gather_pulses, hidden_lines, line_evidence)
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import (
     ACCURACY, FALSE_ALARM, Residual, residual, Sensitivity)
 from sa_jitter_ros.inference.unsteady import SCATTER, unsteady_lines, UnsteadyLine
 from sa_jitter_ros.prediction.amplitudes import component_gain
 from sa_jitter_ros.prediction.influence import AveragePulses
+from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
+_HELD_OUT = 6  # acquisitions: up to half of few ones, a third of many
 _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 
@@ -77,9 +82,16 @@ class Bench:
             item for item in self.declared if item.timing is None
             and np.any(item.gain(self.observation.model) != 1.0)]
 
+    @property
+    def few(self) -> list[int]:
+        """Return the slowest, median and fastest of the acquisitions that fit parameters."""
+        items = self.observation.acquisitions
+        slower = sorted(self.fit, key=lambda a: float(np.ptp(items[a].times)), reverse=True)
+        return sorted({slower[0], slower[len(slower) // 2], slower[-1]})
+
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
         """Return the evidence of some acquisitions, less what effects explain."""
-        return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
+        return gather(self.observation, chosen, self.pulses, self.clock,
                       self.with_declared(effects), self.scatter)
 
     def with_noise(self, std: float) -> 'Bench':
@@ -140,10 +152,9 @@ class Bench:
     def observed(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """Return attenuation, its variance and amplitude over level (acquisition, line)."""
         items = [self.observation.acquisitions[a] for a in chosen]
-        orders = self.observation.orders.size
 
         def of(name: str) -> Array:
-            return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
+            return self.lines.of(np.array([getattr(item, name) for item in items]))
 
         # raw and corrected amplitude have both lost the rest
         kept = self.scatter.beat.kept * component_gain(
@@ -153,17 +164,20 @@ class Bench:
         return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
                 kept * np.abs(of('raw')) / self.level)
 
+    @cached_property
+    def _levels(self) -> Array:
+        """Return the corrected amplitudes (acquisition, line)."""
+        return self.lines.of(np.abs(self.observation.stacked('corrected')))
+
     def unsteady_lines(self, effects: Sequence[Effect]) -> tuple[UnsteadyLine, ...]:
         """Return the lines that vary more than noise, pulse errors and effects let them."""
-        orders = self.observation.orders.size
         known = self._corrected_variance(effects)
         if not all(item.recovered for item in self.observation.acquisitions) and not (
                 self.observation.against_reference):  # then the pulse errors are in them
             every = range(len(self.observation.acquisitions))
             known = self.expect(effects, every).amplitude_variance.mean(axis=0)
-        return unsteady_lines(
-            self.lines.of(np.abs(self.observation.stacked('corrected')[..., :orders])), known,
-            self.observation.orders, self.observation.channel_names, self.lines)
+        return unsteady_lines(self._levels, known, self.observation.orders,
+                              self.observation.channel_names, self.lines)
 
     def unsteadiness(self, effects: Sequence[Effect]) -> float:
         """
@@ -173,11 +187,9 @@ class Bench:
         not significant. No line counts with more than a steady machine has; lines count by how
         well they tell it, since white noise may be too much for weak lines of coloured noise.
         """
-        orders = self.observation.orders.size
-        amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
-        power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
+        power = np.mean((self._levels / self.level - 1.0) ** 2, axis=0)
         known = self._corrected_variance(effects)
-        count = len(amplitude)
+        count = len(self._levels)
         if special.chdtrc(count, count * np.mean(power / known)) > FALSE_ALARM:
             return 0.0
         beyond = np.average(np.minimum(power - known, SCATTER**2),
@@ -273,3 +285,48 @@ def _shifted(finding: Finding) -> list[Effect]:
             except ValueError:
                 continue
     return found
+
+
+def make_bench(observation: Observation, observations: Sequence[Observation],
+               recordings: Sequence[Recording], declared: Sequence[Effect]) -> Bench:
+    """Return what scoring needs of `observation`, the joined `observations` of `recordings`."""
+    lines = choose_lines(observation)
+    count = len(observation.acquisitions)
+    fit, held_out = parted(count)
+    group = channel_groups(observation)
+    known = [gather_pulses(recording, item, group)
+             for recording, item in zip(recordings, observations)]
+    clock = _one_clock([found for found, _ in known])
+    orders = observation.orders.size
+    corrected = np.abs(observation.stacked('corrected')[list(fit), ..., :orders]).mean(axis=0)
+    hidden = hidden_lines(observation, lines)
+    bench = Bench(
+        observation, lines, lines.of(corrected), [row for _, rows in known for row in rows], clock,
+        group, line_evidence(observation, lines), fit, held_out, tuple(declared))
+    if hidden.count:
+        bench = replace(bench, hidden=replace(
+            bench, lines=hidden, level=hidden.of(corrected), memory=Memory()))
+    return bench.with_moving_source(())
+
+
+def parted(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return acquisitions that fit parameters, and those in the middle that are held out."""
+    few = max(count // 3, min(count // 2, _HELD_OUT))
+    start = (count - few) // 2
+    held_out = tuple(range(start, start + few))
+    return tuple(a for a in range(count) if a not in held_out), held_out
+
+
+def _one_clock(clocks: Sequence[Clock]) -> Clock:
+    """Return the clock of all recordings; raise ModelError where they have different ones."""
+    first = clocks[0]
+    for number, other in enumerate(clocks[1:], start=2):
+        if abs(other.rate - first.rate) > SAME_RATE * first.rate:
+            raise ModelError(f'pulse times of recording 1 lie on {_grid(first)}, those of '
+                             f'recording {number} on {_grid(other)}: one declared model holds for '
+                             'one clock; run the loop on each alone')
+    return first
+
+
+def _grid(clock: Clock) -> str:
+    return f'a grid of {clock.rate:.6g} Hz' if clock.rate else 'no coarse grid'

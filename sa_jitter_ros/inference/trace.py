@@ -30,23 +30,22 @@ from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, effects_of, Finding, RARE
 from sa_jitter_ros.effects.target_geometry import marks_ahead, TargetGeometry
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.inference.benches import few_of, make_bench
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
 from sa_jitter_ros.inference.gate import passed
 from sa_jitter_ros.inference.gathering import choose_lines
-from sa_jitter_ros.inference.limits import limits
+from sa_jitter_ros.inference.limits import (
+    limits, probabilities, published_change, undecided_effects)
 from sa_jitter_ros.inference.not_compared import nothing_compared, unresolved, UNSEEN
 from sa_jitter_ros.inference.observation import CHANCE, Observation, together
 from sa_jitter_ros.inference.refinements import with_its_noise, with_its_ticks
 from sa_jitter_ros.inference.remainder import (
     predicting, scored, SPEED, surest_text, unexplained_check, unexplained_text,
     without_absorbing, without_harmful)
-from sa_jitter_ros.inference.scoring import Bench
+from sa_jitter_ros.inference.scoring import Bench, make_bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_choice import RATIO
 from sa_jitter_ros.inference.trace_result import Trace
-from sa_jitter_ros.inference.undecided import probabilities, published_change, undecided_effects
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -155,7 +154,8 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     if noise is not None:
         say(f'noise of {noise[0]:.3g} per sample, '
             + ('less than declared' if observation.model.noise_is_declared else 'not declared'))
-    whole = _refitted(bench, timing)
+    whole = timing and refitted(timing, stretches(observation, everything, bench.clock),
+                                bench.declared)
     chosen, present = _of_timing(bench, timing, whole)
     bench, refinements, chosen, present = with_its_ticks(bench, chosen, present)
     tell(chosen)
@@ -185,15 +185,14 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     not_testable = {**bench.unidentifiable, **_without_timing(timing)}
     candidates += _not_tried(bench, timing, candidates, known)
     final = tuple(_on_all(bench, whole, [*chosen, *present, *refinements]))
-    few, own = partial(bench.change, chosen=few_of(bench)), scores.unsteadiness
+    few, own = partial(bench.change, chosen=bench.few), scores.unsteadiness
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         final[:len(chosen)], final[len(chosen):len(chosen) + len(present)], tuple(candidates),
         scores.before, scores.after, attenuation,
         amplitude, scores.bench.expect((), everything, unsteadiness=own),
-        scores.bench.expect(effects, everything, unsteadiness=own), evidence,
-        'unexplained' if left_over else 'traced' if chosen else 'none', own, timing, left,
-        rows, (*undecided_effects(few, effects, rows), *assumed),
+        scores.bench.expect(effects, everything, unsteadiness=own), evidence, own, rows,
+        (*undecided_effects(few, effects, rows), *assumed),
         probabilities(candidates, timing, [item.name for item in chosen], not_testable), '', noise,
         final[len(chosen) + len(present):], as_declared, gained, left_over, unsteady, not_testable,
         bench.clock)
@@ -260,8 +259,8 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
         if known and whole and again and again.effect and not departs(
                 again.effect, again.standard_errors, known, whole.chooser.data.cycles):
             continue
-        others = [item.effect for item in findings if item is not finding
-                  and item.effect is not None and item.name != SPEED]
+        others = effects_of(item for item in findings
+                            if item is not finding and item.name != SPEED)
         effect = finding.effect
         assert effect is not None
         change = bench.change(others, effect)
@@ -278,13 +277,6 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
             present.append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
     return chosen, [item for item in present if item.name != SPEED]
-
-
-def _refitted(bench: Bench, timing: Timing | None) -> Timing | None:
-    """Return the timing with parameters that fit all acquisitions; the effects are as chosen."""
-    everything = range(len(bench.observation.acquisitions))
-    return timing and refitted(
-        timing, stretches(bench.observation, everything, bench.clock), bench.declared)
 
 
 def _on_all(bench: Bench, timing: Timing | None, findings: Sequence[Finding]) -> list[Finding]:

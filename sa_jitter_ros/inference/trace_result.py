@@ -24,8 +24,6 @@ from sa_jitter_ros.inference.gate import NO_GAIN, ScoreGain
 from sa_jitter_ros.inference.limits import EffectLimit
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import Residual, UNDEFINED
-from sa_jitter_ros.inference.timing import Timing
-from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.inference.unsteady import UnsteadyLine
 
 HARMS = 'held-out acquisitions are predicted worse with it than with the declared model'
@@ -69,10 +67,7 @@ class Trace:
     prediction_before: Expectation
     prediction_after: Expectation
     evidence: Evidence | None
-    verdict: str
     unsteadiness: float
-    timing: Timing | None
-    left: Check | None
     limits: tuple[EffectLimit, ...]
     undecided: tuple[str, ...]
     probabilities: Mapping[str, float]
@@ -85,6 +80,11 @@ class Trace:
     unsteady: tuple[UnsteadyLine, ...] = ()
     not_testable: Mapping[str, str] = field(default_factory=dict)
     clock: Clock = NO_CLOCK
+
+    @property
+    def verdict(self) -> str:
+        """Return `unexplained` where something remains, else `traced` or `none`."""
+        return 'unexplained' if self.remains else 'traced' if self.findings else 'none'
 
     def __post_init__(self) -> None:
         """Refuse effects with which held-out acquisitions are predicted worse."""
