@@ -134,7 +134,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if measured.size < _FEWEST:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
                              'check that the tach waveform crosses its threshold')
-    pulses, validator = _validated(
+    pulses, displaced, validator = _validated(
         measured, recording.duration, model.pulses_per_revolution, step, **recording.target)
     counts, causes = validator.finish(), validator.take_messages()
     spurious = counts.doubles + counts.early
@@ -147,7 +147,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise RecordingError(
             f'{dropped} of {measured.size} pulses follow each other at no interval that a shaft '
             'could have: ' + (causes or ['see what check_keyphasor finds in them'])[0])
-    found = pulses.every(step)
+    found = _every(step, pulses, displaced)
     if found.times.size < _FEWEST or not np.any(found.missing == 0):
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
                              f'pulses: the loop needs {_FEWEST} in a row; record longer')
@@ -160,14 +160,14 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     reference, other = None, recording.reference_pulse_times
     itself = other is not None and np.array_equal(measured, other)
     if other is not None and not itself:
-        better, _ = _validated(other, recording.duration)
+        better, moved, _ = _validated(other, recording.duration)
         if better.times.size < _FEWEST:
             raise RecordingError(f'{better.times.size} valid reference_pulse_times, at least '
                                  f'{_FEWEST} are needed: give those of all pulses, or none')
         # one pulse of the reference in each trigger cycle, or as many as there are of the other
         longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
-        reference = _matched(found, better.every(1), step if longer**2 < step else 1)
-    remarks = [*_remarks(counts, measured.size, int(pulses.displaced.sum())),
+        reference = _matched(found, _every(1, better, moved), step if longer**2 < step else 1)
+    remarks = [*_remarks(counts, measured.size, int(displaced.sum())),
                *_tach_rate_remark(recording, model)]
     if itself and recording.pulse_times is not None:
         remarks.append('reference_pulse_times are the pulse times themselves: they tell nothing '
@@ -176,38 +176,27 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
                         found.bridged, reference, tuple(remarks), found.displaced)
 
 
-@dataclass(frozen=True)
-class _Accepted:
-    """Accepted pulses (k,) with interpolated missing ones, numbered over all gaps."""
-
-    times: FloatArray
-    number: IntArray
-    measured: BoolArray
-    starts_run: BoolArray
-    doubtful: BoolArray
-    displaced: BoolArray
-
-    def every(self, step: int) -> RecordPulses:
-        """Return the pulses whose number is a multiple of `step`."""
-        chosen = self.number % step == 0
-        there = np.flatnonzero(chosen & self.measured)
-        number = self.number // step
-        bridged = np.full(int(number[-1]) + 1 if number.size else 0, np.nan)
-        bridged[number[chosen]] = self.times[chosen]
-        run = np.cumsum(self.starts_run)[there]
-        displaced = np.diff(np.cumsum(chosen & self.displaced)[there])
-        first, last = (int(number[there[k]]) if there.size else 0 for k in (0, -1))
-        return RecordPulses(
-            self.times[there], np.asarray(np.diff(number[there]) - 1, np.int64),
-            np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1],
-            displaced=displaced)
+def _every(step: int, pulses: TriggerPulses, displaced: BoolArray) -> RecordPulses:
+    """Return the pulses whose number over all gaps, their count, is a multiple of `step`."""
+    chosen = pulses.count % step == 0
+    there = np.flatnonzero(chosen & pulses.measured)
+    number = pulses.count // step
+    bridged = np.full(int(number[-1]) + 1 if number.size else 0, np.nan)
+    bridged[number[chosen]] = pulses.times[chosen]
+    run = np.cumsum(pulses.starts_run)[there]
+    first, last = (int(number[there[k]]) if there.size else 0 for k in (0, -1))
+    return RecordPulses(
+        pulses.times[there], np.asarray(np.diff(number[there]) - 1, np.int64),
+        np.diff(run, prepend=0) > 0, pulses.doubtful[there], bridged[first:last + 1],
+        displaced=np.diff(np.cumsum(chosen & displaced)[there]))
 
 
 def _validated(times: FloatArray, longest: float, marks: int = 1, step: int = 1, **target: Any
-               ) -> tuple[_Accepted, PulseValidator]:
+               ) -> tuple[TriggerPulses, BoolArray, PulseValidator]:
     """
-    Return the accepted pulses of a target of so many marks, and what validated all of them.
+    Return the accepted pulses of a target of so many marks, numbered by `count` over all gaps.
 
+    Which of the missing ones came far from their place, and what validated all, is returned, too.
     A gap that is `longest` (s) has no vibration behind it, so that pulses need no number there.
     Uneven angles of the `target` are taken from the times as in an average, unless every trigger
     cycle, of `step` pulses, begins at the same mark.
@@ -232,8 +221,8 @@ def _validated(times: FloatArray, longest: float, marks: int = 1, step: int = 1,
     dropped = np.setdiff1d(times, came[found.measured])
     displaced = np.isin(np.arange(number.size),
                         np.searchsorted(0.5 * (came[1:] + came[:-1]), dropped))
-    return (_Accepted(found.times if step % marks else came, number, found.measured,
-                      found.starts_run, doubtful, displaced & ~found.measured), validator)
+    return (replace(found, times=found.times if step % marks else came, count=number,
+                    doubtful=doubtful), displaced & ~found.measured, validator)
 
 
 def _as_they_came(times: FloatArray, found: TriggerPulses, number: IntArray,
