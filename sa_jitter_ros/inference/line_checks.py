@@ -111,12 +111,12 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
     noise = np.sqrt(np.maximum(np.mean(lines.of(observation.stacked('noise')) ** 2, axis=0),
                                0.5 * variance[lines.order]))
     order = observation.orders[lines.order]
-    run, number = _runs(observation)
+    run, number, late = _runs(observation)
     turned = amplitude * np.exp(
         -2j * np.pi * observation.model.cycle_length * np.outer(number, order))
     # late pulses are ahead by an angle that follows the speed of their acquisition
-    turned *= np.exp(-2j * np.pi * np.outer(_late(observation) / observation.periods
-                                            * observation.model.cycle_length, order))
+    turned *= np.exp(-2j * np.pi * np.outer(
+        late / observation.periods * observation.model.cycle_length, order))
     weight = order**2 * np.mean(np.abs(amplitude), axis=0) ** 2 / noise**2
     # all lines of an acquisition may be late by one time
     late = np.angle(turned / _means(run, turned)) / order @ (weight / weight.sum())
@@ -133,20 +133,24 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
             *_follows(observation, np.abs(ratio), noise))
 
 
-def _runs(observation: Observation) -> tuple[Array, Array]:
+def _runs(observation: Observation) -> tuple[Array, Array, Array]:
     """
-    Return the run of each acquisition, and the number of its first trigger pulse (acquisition,).
+    Return the run of each acquisition, the number of its first trigger pulse, and its delay.
 
-    A run is an unbroken stretch of a recording: how many cycles lie between two is not known.
+    A run is an unbroken stretch of a recording: how many cycles lie between two is not known. By
+    the delay (s) the pulses of the acquisition are late in the mean.
     """
-    runs, numbers = [], []
+    runs, numbers, late = [], [], []
     for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
         recovery = observation.recoveries[recording]
         number = int(recovery.pulses.number[item.first])
         runs.append((recording, next((part.start for part in recovery.stretches
                                       if part.start <= number < part.stop), -1)))
         numbers.append(number)
-    return np.unique(runs, axis=0, return_inverse=True)[1].ravel(), np.array(numbers)
+        errors = recovery.errors[item.first:item.first + item.times.size]
+        late.append(float(np.nan_to_num(errors.mean())))
+    return (np.unique(runs, axis=0, return_inverse=True)[1].ravel(), np.array(numbers),
+            np.array(late))
 
 
 def _means(run: Array, values: Array) -> Array:
@@ -161,15 +165,6 @@ def _accelerations(observation: Observation) -> Array:
     grows = np.array([np.polyfit(np.arange(item.bridged.size), item.bridged, 2)[0]
                       for item in observation.acquisitions])
     return np.asarray(grows - grows.mean())
-
-
-def _late(observation: Observation) -> Array:
-    """Return by how much the pulses of each acquisition are late in the mean, in s."""
-    late = []
-    for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
-        errors = observation.recoveries[recording].errors
-        late.append(float(np.nan_to_num(errors[item.first:item.first + item.times.size].mean())))
-    return np.array(late)
 
 
 def _turns(observation: Observation, ratio: Array, noise: Array, order: Array, freedom: int
