@@ -23,6 +23,7 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray
 from sa_jitter_ros.averaging.spectral_lines import FALSE
+from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
@@ -124,9 +125,9 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
     Fit states and lines by turns until no line is found any more.
 
     Lines that are `known` come after steps, too: high ones follow a trend that the declared ones
-    have shown.
+    have shown. Slips are mended as long as the lines fit better by it.
     """
-    look, lines, mended = known is None, known or ((), ()), 0
+    look, lines, before = known is None, known or ((), ()), -math.inf
     while True:
         _settle(states)
         (orders, tones), lines = new_lines(states) if look else lines, ((), ())
@@ -135,10 +136,12 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
             if look:
                 refine(states)
                 let_stand(states, fit_lines(states), searching=True)
-        elif mended == _MOST_STEPS or not mend_slips(states):
-            break
         else:
-            mended += 1
+            likelihood = 0.5 * states.whole.sum() * states.u.size * float(
+                np.sum(np.log(states.weight)))
+            if likelihood < before + ODDS or not mend_slips(states):
+                break
+            before = likelihood
     if look:
         let_stand(states, prune(states, _PRUNED), searching=False)
         for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near

@@ -142,7 +142,8 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, MARGIN / rate)
     wider = 1.0
     recovery = _joined(pulses, stretches, fits(known, wider))
-    if not recovery.resolved and ends(_WIDER) != ends(wider):
+    held = any(fit.held for fit in recovery.fits)  # else nothing tells the angle of other orders
+    if held and not recovery.resolved and ends(_WIDER) != ends(wider):
         found = _joined(pulses, stretches, fits(known, _WIDER))
         if found.resolved:  # orders that shafts must have tell how long the cycles are
             orders, tones = found.undeclared
