@@ -291,7 +291,7 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
 
 def _numbers(observation: Observation, cycles: int) -> IntArray:
     """Return numbers (acquisition, cycle) of so many cycles each; as many are left out at gaps."""
-    begin = observation.pulses.number[[item.first for item in observation.acquisitions]]
+    begin = observation.first_numbers
     apart = np.cumsum(np.diff(begin, prepend=begin[0] - cycles) != cycles)
     return np.asarray(np.add.outer(cycles * (np.arange(begin.size) + apart), np.arange(cycles)))
 
@@ -299,8 +299,7 @@ def _numbers(observation: Observation, cycles: int) -> IntArray:
 def _beside(observation: Observation, lines: Lines, tone: Tone, times: Array) -> Array:
     """Return the wave (acquisition, cycle, line) of a tone beside lines at `times` in s."""
     places = np.arange(times.shape[1]) + 0.5  # middles of cycles
-    angle = observation.model.cycle_length * np.array(
-        [observation.pulses.number[item.first] + places for item in observation.acquisitions])
+    angle = observation.model.cycle_length * np.add.outer(observation.first_numbers, places)
     turns = tone.frequency * times[..., None] - (
         angle[..., None] * observation.orders[lines.order])
     return np.asarray(np.exp(2j * np.pi * turns))

@@ -140,16 +140,15 @@ def _runs(observation: Observation) -> tuple[Array, Array, Array]:
     A run is an unbroken stretch of a recording: how many cycles lie between two is not known. By
     the delay (s) the pulses of the acquisition are late in the mean.
     """
-    runs, numbers, late = [], [], []
-    for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
+    runs, late = [], []
+    for item, recording, number in zip(observation.acquisitions, observation.recording.tolist(),
+                                       observation.first_numbers.tolist()):
         recovery = observation.recoveries[recording]
-        number = int(recovery.pulses.number[item.first])
         runs.append((recording, next((part.start for part in recovery.stretches
                                       if part.start <= number < part.stop), -1)))
-        numbers.append(number)
         errors = recovery.errors[item.first:item.first + item.times.size]
         late.append(float(np.nan_to_num(errors.mean())))
-    return (np.unique(runs, axis=0, return_inverse=True)[1].ravel(), np.array(numbers),
+    return (np.unique(runs, axis=0, return_inverse=True)[1].ravel(), observation.first_numbers,
             np.array(late))
 
 

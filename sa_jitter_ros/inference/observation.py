@@ -187,6 +187,12 @@ class Observation:
         first = np.array([item.first for item in self.acquisitions])
         return np.cumsum(np.diff(first, prepend=first[:1] - 1) <= 0)
 
+    @property
+    def first_numbers(self) -> IntArray:
+        """Return the number, in its recording, of each acquisition's first trigger pulse."""
+        return np.array([self.recoveries[recording].pulses.number[item.first] for item, recording
+                         in zip(self.acquisitions, self.recording.tolist())])
+
     def stacked(self, field: str) -> Array:
         """Return one field of all acquisitions as an array."""
         return np.array([getattr(item, field) for item in self.acquisitions])

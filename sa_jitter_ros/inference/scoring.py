@@ -15,7 +15,7 @@ The scale of the residual includes the unexplained scatter of the amplitudes (un
 the scatter that noise, jitter and effects predict.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -102,15 +102,19 @@ class Bench:
         return replace(self, observation=replace(self.observation, model=model), memory=Memory(),
                        hidden=self.hidden and self.hidden.with_noise(std))
 
+    def declaring_only(self, effects: Iterable[Effect]) -> 'Bench':
+        """Return the bench of a model that declares these effects."""
+        declared = tuple(effects)
+        return replace(self, declared=declared,
+                       hidden=self.hidden and self.hidden.declaring_only(declared))
+
     def without(self, name: str) -> 'Bench':
         """Return the bench of a model that does not declare an effect."""
-        return replace(self, declared=tuple(
-            item for item in self.declared if item.name != name))
+        return self.declaring_only(item for item in self.declared if item.name != name)
 
     def declaring(self, effects: Sequence[Effect]) -> 'Bench':
         """Return the bench of a model that declares some more effects."""
-        return replace(self, declared=(*self.declared, *effects),
-                       hidden=self.hidden and self.hidden.declaring(effects))
+        return self.declaring_only((*self.declared, *effects))
 
     def with_declared(self, effects: Sequence[Effect]) -> list[Effect]:
         """Return the declared effects and others, which take the place of those of their name."""

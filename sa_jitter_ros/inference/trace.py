@@ -203,9 +203,10 @@ def _with_its_growth(bench: Bench, timing: Timing | None) -> Bench:
     if timing is None or ClockSkew.name in timing.choice.best:
         return bench
     share = timing.choice.fit.sizes[timing.choice.fit.columns.get(RATIO, slice(0))]
-    return replace(bench, declared=tuple(
+    return bench.declaring_only(
         replace(item, by_angle=float(share[0] / item.in_timing(timing.choice.setting)[0]))
-        if isinstance(item, ClockSkew) and share.size else item for item in bench.declared))
+        if isinstance(item, ClockSkew) and item.skew and share.size else item
+        for item in bench.declared)
 
 
 def _of_findings(chosen: Sequence[Finding], present: Sequence[Finding],
