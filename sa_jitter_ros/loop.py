@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, MISSING, replace
 from datetime import datetime, timezone
 from functools import cached_property, partial
+from itertools import combinations
 import math
 import os
 from pathlib import Path
@@ -28,7 +29,7 @@ import warnings
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.effects import declared_effects
-from sa_jitter_ros.errors import DataWarning, ModelError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, ModelError, RecordingError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.record_pulses import SAME_RATIO
 from sa_jitter_ros.inference.trace import trace
@@ -38,7 +39,8 @@ from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
-from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
+from sa_jitter_ros.recordings.channel_check import (
+    channel_faults, copied_channels, is_copy, is_lost, without_channels)
 from sa_jitter_ros.report.report import parameters_text, report, summary
 from sa_jitter_ros.whole_files import finished_together
 
@@ -198,6 +200,9 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     opened = [item if isinstance(item, Recording) else read(item) for item in recordings]
     opened, faults = _usable(opened, names)
     opened = [_with_pulses(item) for item in opened]
+    for (one, name), (other, again) in combinations(zip(opened, names), 2):
+        if is_copy(one, other):
+            raise RecordingError(f'{again} holds what {name} holds: give each recording once')
     if isinstance(declared, (str, os.PathLike)):
         opened = [on_target(item, Path(declared)) for item in opened]
     declaration = _declaration(declared, opened[0].sample_rate)
@@ -237,13 +242,14 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
 
 def _usable(recordings: Sequence[Recording], names: Sequence[str]
             ) -> tuple[list[Recording], list[str]]:
-    """Return the recordings without channels that hold nothing in one of them; what is wrong."""
+    """Return the recordings without channels that hold nothing new in one; what is wrong."""
     lost: set[int] = set()
     faults = []
     for name, recording in zip(names, recordings):
         found = channel_faults(recording, most_lost=0.0)
         if sum(map(is_lost, found.values())) == recording.channels:  # then gaps cost cycles
             found = channel_faults(recording)
+        found = copied_channels(recording) | found
         for channel, reason in found.items():
             lost |= {channel} if is_lost(reason) else set()
             faults.append(f'{name}: {recording.channel_names[channel]} {reason}'

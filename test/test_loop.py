@@ -20,7 +20,7 @@ import pytest
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import DataWarning, ModelError, ParameterError, RecordingError
-from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.inference.observation import observe, together
 from sa_jitter_ros.loop import close_loop
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.npz_format import write_npz
@@ -90,14 +90,17 @@ def test_written_report_is_the_report(found, tmp_path):
 
 
 @pytest.mark.machines
-def test_channel_of_nearly_nothing_is_left_out(recording, found):
-    samples = np.concatenate([recording.read(), 1e-200 * recording.read()])
-    with pytest.warns(DataWarning, match='channel 1 is constant and is left out'):
+def test_channel_of_nearly_nothing_or_nothing_new_is_left_out(recording, found):
+    samples = recording.read() * [[1.0], [1e-200], [1.0]]
+    with pytest.warns(DataWarning) as said:
         both = close_loop(Recording(ArraySource(samples), RATE,
                                     pulse_times=recording.pulse_times), KEYWORDS)
+    assert {str(item.message).partition(': ')[2] for item in said} == {
+        'channel 1 is constant and is left out',
+        'channel 2 holds the samples of channel 0 again and is left out'}
     assert both.report['missing_effects'] == found.report['missing_effects']
     with pytest.warns(DataWarning, match='channel 0 is constant'):
-        alone = close_loop(Recording(ArraySource(samples[1:]), RATE,
+        alone = close_loop(Recording(ArraySource(samples[1:2]), RATE,
                                      pulse_times=recording.pulse_times), KEYWORDS)
     assert alone.verdict == 'none'
     assert alone.report['error_before']['rms'] is None
@@ -123,6 +126,21 @@ def test_gap_in_the_vibration_costs_the_trigger_cycles_that_it_touches(recording
     observation = loop_found.traces['shaft'].observation
     assert len(observation.channel_names) == len(samples)
     assert len(observation.acquisitions) >= 15
+
+
+@pytest.mark.machines
+def test_trigger_pulses_of_each_recording_are_numbered_by_themselves(recording):
+    """Two pulses that the first one lacks move no number of the second."""
+    model = DeclaredModel(**{**KEYWORDS, 'trigger_cycles': 10, 'sample_rate': RATE})
+    short = replace(recording, vibration=ArraySource(recording.read()[:, :10_000]),
+                    pulse_times=recording.pulse_times[:50])
+    lacking = replace(short, pulse_times=np.delete(short.pulse_times, [14, 15]))
+    observations = [observe(item, model) for item in (lacking, short)]
+    first, second = (item.first_numbers for item in observations)
+    np.testing.assert_array_equal(np.diff(second), 10)
+    assert np.any(np.diff(first) != 10)
+    np.testing.assert_array_equal(
+        together(observations).first_numbers, np.concatenate([first, second]))
 
 
 @pytest.mark.machines
@@ -225,6 +243,8 @@ def test_unusable_input_is_named(recording, tmp_path):
         close_loop(replace(recording, pulse_times=1e3 * recording.pulse_times), KEYWORDS)
     with pytest.raises(RecordingError, match='no such file'):
         close_loop(tmp_path / 'none.npz', KEYWORDS)
+    with pytest.raises(RecordingError, match=r'^two holds what one holds: give each'):
+        close_loop([recording, recording], KEYWORDS, names=['one', 'two'])
 
 
 @pytest.mark.machines

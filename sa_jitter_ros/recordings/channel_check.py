@@ -98,11 +98,42 @@ def channel_faults(recording: Recording, *, most_lost: float = _MOST_LOST) -> di
 
     `most_lost` is that of `bad_channels`.
     """
+    return bad_channels(_first_samples(recording), most_lost=most_lost)
+
+
+def copied_channels(recording: Recording) -> dict[int, str]:
+    """
+    Return the channels that repeat an earlier one sample by sample, with the reason.
+
+    >>> from sa_jitter_ros.recordings.recording import ArraySource
+    >>> row = np.sin(np.arange(99.0))
+    >>> copied_channels(Recording(ArraySource(np.array([row, 2.0 * row, row])), 1e3))
+    {2: 'holds the samples of channel 0 again'}
+    """
+    samples, found = _first_samples(recording), {}
+    for channel in range(1, len(samples)):
+        for other in range(channel):
+            if channel not in found and np.array_equal(
+                    samples[channel], samples[other], equal_nan=True):
+                found[channel] = f'holds the samples of {recording.channel_names[other]} again'
+    return found
+
+
+def is_copy(one: Recording, other: Recording) -> bool:
+    """Return whether two recordings hold the same first samples and the same pulse times."""
+    first, second = (np.zeros(0) if item.pulse_times is None else item.pulse_times
+                     for item in (one, other))
+    return np.array_equal(first, second) and np.array_equal(
+        _first_samples(one), _first_samples(other), equal_nan=True)
+
+
+def _first_samples(recording: Recording) -> FloatArray:
+    """Return the samples (channel, sample) by which channels are judged, none up to a defect."""
     count = min(recording.samples, max(_FIRST_VALUES // recording.channels, 1))
     try:
-        return bad_channels(next(recording.blocks(count)), most_lost=most_lost)
+        return next(recording.blocks(count))
     except RecordingError:  # it is told to who reads up to the defect
-        return {}
+        return np.zeros((0, 0))
 
 
 def without_channels(recording: Recording, bad: Collection[int]) -> Recording:
