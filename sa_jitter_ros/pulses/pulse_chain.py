@@ -90,17 +90,17 @@ def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRA
     best, cheapest = _most_likely(
         pulses, scatter, stray, limit=math.inf if unsteady else _CHAIN_COST * pulses.size)
     # If both explanations take all pulses for true, the scatter of the speed is the better one.
-    if unsteady and ((best is not None and set(best.marks) == {1})
+    if unsteady and ((best is not None and set(best.passed) == {1})
                      or levels.size * (_each(unsteady) + 0.5) < cheapest):
         return replace(every, unsteady=True)
     if best is None or best.cost > _CHAIN_COST * pulses.size:
         return None
-    marks = np.array(best.marks, np.int64)
-    true = np.flatnonzero(marks)
+    passed = np.array(best.passed, np.int64)
+    true = np.flatnonzero(passed)
     levels = np.array([best.steps[number].level for number in true[1:]])
     if best.steps[-1].jumps:
         levels[-1] = np.nan  # no pulse behind shows which end of this interval is displaced
-    return Chain(true, marks[true[1:]], levels)
+    return Chain(true, passed[true[1:]], levels)
 
 
 def _each(scatter: float) -> float:
@@ -131,7 +131,7 @@ def _most_likely(pulses: FloatArray, scatter: float | None, stray: float, limit:
                 break
         paths.sort(key=itemgetter(0))
         cheapest = min([cheapest, *(path.cost for path in paths[:1])])
-        found = next((path for path in paths if _acceptable(path.marks)), None)
+        found = next((path for path in paths if _acceptable(path.passed)), None)
         if found is not None and (best is None or found.cost < best.cost):
             best, limit = found, min(limit, found.cost)
     return best, cheapest
@@ -158,13 +158,13 @@ def unsteadiness(levels: FloatArray) -> float:
     return 0.0
 
 
-def _acceptable(marks: tuple[int, ...]) -> bool:
+def _acceptable(passed: tuple[int, ...]) -> bool:
     """Whether enough pulses are true to call them a chain: of few all but one, of many a half."""
-    true = sum(mark > 0 for mark in marks)
-    least = len(marks) - (1 if len(marks) < 6 else 2)
-    if len(marks) >= _FEW:
-        least = (len(marks) + 1) // 2
-    return true >= max(3, least) and bool(marks[-1] or marks[-2])
+    true = sum(slots > 0 for slots in passed)
+    least = len(passed) - (1 if len(passed) < 6 else 2)
+    if len(passed) >= _FEW:
+        least = (len(passed) + 1) // 2
+    return true >= max(3, least) and bool(passed[-1] or passed[-2])
 
 
 def robust_square(squares: FloatArray) -> FloatArray:

@@ -80,7 +80,7 @@ class PulseFollower:
     about are taken away; the true ones go to the `sink`.
     `confirmed` (s) is the latest of these. Once the match is `lost`, nothing is decided; of a
     `probe`, which has no trigger cycles to lose, it is lost wherever the number of passed teeth is
-    not sure. `marks`, `levels` and `times` are those of the intervals since the pattern of the
+    not sure. `slots`, `levels` and `times` are those of the intervals since the pattern of the
     marks was learnt, which a probe does not learn.
     """
 
@@ -91,7 +91,7 @@ class PulseFollower:
         self._sink, self._verdicts, self._probe = sink, verdicts, probe
         self.lost = False
         self.slot = lock.slot
-        self.marks: list[int] = []
+        self.slots: list[int] = []
         self.levels: list[float] = []
         self.times: list[float] = []
         self._learnt = 0  # times that the pattern was learnt
@@ -190,15 +190,15 @@ class PulseFollower:
         lock = self._lock
         if lock.steps.size == 1:
             return
-        self.marks += slots
+        self.slots += slots
         self.levels += levels
         self.times += times
         if self._room_of_marks <= 0:
             self._lock = lock.with_pattern(
-                mark_pattern(np.array(self.marks, np.int64), np.array(self.levels),
+                mark_pattern(np.array(self.slots, np.int64), np.array(self.levels),
                              lock.steps.size), weight=1.0 / min(2 + self._learnt, 8))
             self._learnt += 1
-            self.marks, self.levels, self.times = [], [], []
+            self.slots, self.levels, self.times = [], [], []
 
     # --- doubtful pulses ---
 
@@ -253,34 +253,34 @@ class PulseFollower:
         """Decide about the first pulses if the likely paths agree about them."""
         near = likely(paths)
         if self._model.hides_missing:
-            near = [path for path in near if path.steps[0].mark == 1] or near
+            near = [path for path in near if path.steps[0].passed == 1] or near
         best = near[0]
-        marks, first = best.marks, best.steps[0]
-        if all(path.steps[0].mark == first.mark for path in near):
-            if first.mark == 0:
-                if not (any(marks) or final):  # strays come between true pulses
+        passed, first = best.passed, best.steps[0]
+        if all(path.steps[0].passed == first.passed for path in near):
+            if first.passed == 0:
+                if not (any(passed) or final):  # strays come between true pulses
                     return False
                 self._drop_stray()
                 return True
-            if first.mark == 1 and (abs(first.off) <= self._tolerance or (
+            if first.passed == 1 and (abs(first.off) <= self._tolerance or (
                     self._model.unsteady and not first.jumps)):
                 self._accept(first.level)
                 return True
-            later = [step.level for step in best.steps[1:] if step.mark]
+            later = [step.level for step in best.steps[1:] if step.passed]
             if not later and not final:
                 return False
-            self._irregular(first.mark, first.level, first.off, later[0] if later else None)
+            self._irregular(first.passed, first.level, first.off, later[0] if later else None)
             return True
-        count = len(marks)
-        if count < 3 or not (marks[-1] and marks[-2]):
+        count = len(passed)
+        if count < 3 or not (passed[-1] and passed[-2]):
             return False
-        if any(path.marks[-2:] != marks[-2:] or sum(path.marks) != sum(marks) for path in near):
+        if any(one.passed[-2:] != passed[-2:] or sum(one.passed) != sum(passed) for one in near):
             return False
         # Which of the pulses before is true makes no difference to these two.
-        skipped = sum(marks[:-1])
+        skipped = sum(passed[:-1])
         for _ in range(count - 2):
             self._drop('early')
-        slots, _ = self._passed(skipped)
+        slots, _ = self._next_slots(skipped)
         gap = self._queue[0] - self.confirmed
         level = math.log(gap / float(self._lock.widths[slots].sum()))
         off = math.expm1(level - self._model.expected)  # a path that jumps miscounts them
@@ -301,22 +301,22 @@ class PulseFollower:
 
     def _accept(self, level: float) -> None:
         """Accept the first waiting pulse, one slot after the last one."""
-        slots, steps = self._passed(1)
+        slots, steps = self._next_slots(1)
         pulse = self._next(slots, level)
         self._model.accept([level])
         self._lacking = []
         self._sink.extend([pulse], [steps])
 
-    def _irregular(self, mark: int, level: float, deviation: float, after: float | None) -> None:
+    def _irregular(self, passed: int, level: float, deviation: float, after: float | None) -> None:
         """
         Accept the first waiting pulse, whose interval needs an explanation.
 
         `after` is the level of the interval behind it, None if there is none.
         """
         model, tolerance = self._model, self._tolerance
-        slots, steps = self._passed(mark)
+        slots, steps = self._next_slots(passed)
         gap = self._queue[0] - self.confirmed
-        if mark == 1 and after is not None and abs(math.expm1(level - model.level)) <= max(
+        if passed == 1 and after is not None and abs(math.expm1(level - model.level)) <= max(
                 _RAMP, self._options.tolerance):
             low, high = sorted((model.level, after))
             if low - tolerance <= level <= high + tolerance:  # the speed changes
@@ -324,25 +324,25 @@ class PulseFollower:
                 model.jump(level)
                 self._sink.extend([pulse], [steps])
                 return
-        if mark > 1 and abs(deviation) <= tolerance:
+        if passed > 1 and abs(deviation) <= tolerance:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
-            self._verdicts.counts[kind] += mark - 1
-            self._verdicts.rejected += [(self.confirmed + gap * number / mark, 'missing')
-                                        for number in range(1, min(mark, _MOST_WAITING))]
+            self._verdicts.counts[kind] += passed - 1
+            self._verdicts.rejected += [(self.confirmed + gap * number / passed, 'missing')
+                                        for number in range(1, min(passed, _MOST_WAITING))]
             pulse = self._next(slots, level)
             model.accept([level])
-            if self._lacks_alike(mark, gap) or not self._options.bridge:
+            if self._lacks_alike(passed, gap) or not self._options.bridge:
                 self._sink.begin(pulse, 0, passed=steps)
             else:
                 self._sink.extend([pulse], [steps])
             return
         self._verdicts.reject(self._queue[0], 'late')
-        passed = self._slots_in(gap, model.level, self.slot)
-        if after is not None and passed != self._slots_in(gap, after, self.slot):
-            passed = 0
-        known = passed == mark or (mark == 1 and after is not None and passed > 0)
+        across = self._slots_in(gap, model.level, self.slot)
+        if after is not None and across != self._slots_in(gap, after, self.slot):
+            across = 0
+        known = across == passed or (passed == 1 and after is not None and across > 0)
         if known:
-            slots, steps = self._passed(passed)
+            slots, steps = self._next_slots(across)
         # A step of the time may be whole by chance: uneven marks tell which of them comes next.
         long = gap > _LONG * float(self._lock.widths.sum()) * math.exp(model.level)
         alike = self._lock.even and bool(np.all(self._lock.widths == 1.0))
@@ -357,15 +357,15 @@ class PulseFollower:
             model.jump(after)
         self._sink.begin(pulse, 0, passed=steps if known else None)
 
-    def _lacks_alike(self, mark: int, gap: float) -> bool:
+    def _lacks_alike(self, passed: int, gap: float) -> bool:
         """Take the latest interval for the usual one if many have lacked as many pulses."""
-        self._lacking = [*self._lacking, mark] if mark in self._lacking else [mark]
+        self._lacking = [*self._lacking, passed] if passed in self._lacking else [passed]
         if len(self._lacking) < _LACKING:
             return False
         level = self._model.level
-        self.report_change(gap, level, level + math.log(mark))
+        self.report_change(gap, level, level + math.log(passed))
         self._verdicts.counts['relearnt'] += 1
-        self._model.jump(level + math.log(mark))
+        self._model.jump(level + math.log(passed))
         self._lacking = []
         return True
 
@@ -390,9 +390,9 @@ class PulseFollower:
         """Largest deviation of a regular interval from the last pulse."""
         return max(self._model.tolerance, float(self._lock.believed[self.slot]))
 
-    def _passed(self, mark: int) -> tuple[list[int], int]:
-        """Return the next `mark` slots, and the teeth that they span."""
-        slots = [(self.slot + k) % self._lock.steps.size for k in range(mark)]
+    def _next_slots(self, count: int) -> tuple[list[int], int]:
+        """Return the next `count` slots, and the teeth that they span."""
+        slots = [(self.slot + k) % self._lock.steps.size for k in range(count)]
         return slots, int(self._lock.steps[slots].sum())
 
     def _next(self, slots: list[int], level: float) -> float:
@@ -405,7 +405,7 @@ class PulseFollower:
         self.confirmed = pulse
         self.slot = (slots[-1] + 1) % self._lock.steps.size
         if len(slots) > self._lock.steps.size:  # a gap of more than a revolution
-            self.marks, self.levels, self.times = [], [], []
+            self.slots, self.levels, self.times = [], [], []
         else:
             self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
                        [pulse] * len(slots))

@@ -63,13 +63,13 @@ SIMPLE = (LevelPrediction(0.0, False, (1.0,)), LevelPrediction(0.0, True, (-1.0,
 
 class Step(NamedTuple):
     """
-    What a path says of a pulse: how many slots it is after the last true one, 0 for a stray.
+    What a path says of a pulse: the slots `passed` since the last true one, 0 for a stray.
 
     `level` is that of its interval (NaN for a stray), which is `off` from what is expected. With
     `jumps` no speed explains it.
     """
 
-    mark: int
+    passed: int
     level: float = math.nan
     off: float = 0.0
     jumps: bool = False
@@ -98,9 +98,9 @@ class Path(NamedTuple):
     stray_at: float = -math.inf
 
     @property
-    def marks(self) -> tuple[int, ...]:
-        """Return how many slots each pulse is after the last true one."""
-        return tuple(step.mark for step in self.steps)
+    def passed(self) -> tuple[int, ...]:
+        """Return the slots passed from the last true pulse to each, 0 for a stray."""
+        return tuple(step.passed for step in self.steps)
 
 
 @dataclass(frozen=True)
@@ -156,26 +156,26 @@ class PathRules:
         before, last, slot, recent, chosen, jumped, steps, stray_at = path
         gap, width = pulse - last, 0.0
         found = []
-        for mark in range(1, 2 + self.maximum_missing):
-            if mark > 1 and before + MISSING + MORE_MISSING * (mark - 2) + self.each > limit:
+        for passed in range(1, 2 + self.maximum_missing):
+            if passed > 1 and before + MISSING + MORE_MISSING * (passed - 2) + self.each > limit:
                 break
             width += self.widths[slot]
             slot = (slot + 1) % len(self.widths)
             level = math.log(gap / width)
-            cost, off, using = self._deviation(path, expected, level, mark)
+            cost, off, using = self._deviation(path, expected, level, passed)
             jumps = cost == JUMP
-            if mark > 1 and not jumps:
-                cost += MISSING + MORE_MISSING * (mark - 2) + self._by_chance(path, gap / width)
+            if passed > 1 and not jumps:
+                cost += MISSING + MORE_MISSING * (passed - 2) + self._by_chance(path, gap / width)
             total = before + cost + self.each
-            if (mark == 1 or not jumps) and total <= limit:
-                taken = (*steps, Step(mark, level, off, jumps))
+            if (passed == 1 or not jumps) and total <= limit:
+                taken = (*steps, Step(passed, level, off, jumps))
                 if jumps:  # of the angle, and the speed stays as it was; or of the speed
                     found += [
                         Path(total, pulse, slot, recent, chosen, jumped, taken, stray_at),
                         Path(total + (FRACTION if is_multiple(off) else 0.0), pulse, slot,
                              (*recent[-1:], level), chosen, True, taken, stray_at)]
                 else:
-                    found.append(Path(total, pulse, slot, (*recent, *(level,) * mark)[-REACH:],
+                    found.append(Path(total, pulse, slot, (*recent, *(level,) * passed)[-REACH:],
                                       using, jumped, taken, stray_at))
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
@@ -208,22 +208,22 @@ class PathRules:
                           for level in slowing(recent[-1], recent[-2])]
         return found
 
-    def _deviation(self, path: Path, expected: list[_Prediction], level: float, mark: int
+    def _deviation(self, path: Path, expected: list[_Prediction], level: float, passed: int
                    ) -> tuple[float, float, int]:
         """
         Return how unlikely a level is, its deviation from what is expected, and by which number.
 
-        With missing pulses `level` is that of the mean of `mark` intervals; where the speed
+        With missing pulses `level` is that of the mean of `passed` intervals; where the speed
         changes, it lies half way along them.
         """
         best, off, using = math.inf, 0.0, path.using
-        half, tick = 0.5 * (mark - 1), self.tick / mark
+        half, tick = 0.5 * (passed - 1), self.tick / passed
         scatter, degrees = self.scatter, self.degrees
         for cost, slopes, each, number in expected:
             if cost >= best:
                 continue
             apart = level - each
-            if slopes and mark > 1:
+            if slopes and passed > 1:
                 apart = min(apart, apart - half * (each - path.recent[-1]), key=abs)
             beyond = max(abs(apart) - tick, 0.0) / scatter
             if beyond:  # or NaN

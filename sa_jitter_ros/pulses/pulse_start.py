@@ -169,16 +169,16 @@ class PulseStart:
     def _rehearsed(self, lock: Lock, pulses: FloatArray) -> Lock:
         """Return the lock with the angles between the marks, which the pulses (n,) show."""
         probe = self._probe(_uneven(lock), pulses[lock.first:])
-        marks, levels = np.array(probe.marks, np.int64), np.array(probe.levels)
-        pattern = mark_pattern(marks, levels, lock.steps.size)
+        slots, levels = np.array(probe.slots, np.int64), np.array(probe.levels)
+        pattern = mark_pattern(slots, levels, lock.steps.size)
         if pattern is None:
             return lock
         learnt = lock.with_pattern(pattern)
         # The first pulse may have been a stray, which only the pattern shows.
-        levels = levels + np.log(lock.widths[marks] / learnt.widths[marks])
+        levels = levels + np.log(lock.widths[slots] / learnt.widths[slots])
         begin = regular_start(levels, max(6.0 * pattern.scatter, _LEAST_REGULAR))
         # Behind a long gap a probe notes intervals anew: the first may not be that of the lock.
-        time, slot = (probe.times[begin - 1], int(marks[begin])) if begin else (
+        time, slot = (probe.times[begin - 1], int(slots[begin])) if begin else (
             pulses[lock.first], lock.slot)
         return self._from_earliest(replace(
             learnt, first=int(np.searchsorted(pulses, time)), slot=slot,
@@ -204,16 +204,16 @@ class PulseStart:
         probe = self._probe(_uneven(learnt), pulses[learnt.first:])
         # Before pulses that it could not judge, the last interval is doubtful, too.
         count = len(probe.levels) - (probe.confirmed < pulses[-1])
-        tried = [(np.array(probe.marks[:count], np.int64), np.array(probe.levels[:count]))]
+        tried = [(np.array(probe.slots[:count], np.int64), np.array(probe.levels[:count]))]
         # It may be misled by a displaced pulse, which spoils two of otherwise whole revolutions.
-        marks = (learnt.slot + np.arange(pulses.size - 1 - learnt.first)) % size
-        lengths = np.diff(pulses[learnt.first:]) / learnt.widths[marks]
+        slots = (learnt.slot + np.arange(pulses.size - 1 - learnt.first)) % size
+        lengths = np.diff(pulses[learnt.first:]) / learnt.widths[slots]
         parts = lengths / np.median(lengths)
         if parts.max() < _LACKS_ONE and abs(parts.sum() - parts.size) < 0.5:
-            tried.append((marks, np.log(lengths)))
+            tried.append((slots, np.log(lengths)))
         found = [replace(learnt.with_pattern(every), known=levels.size - size)
-                 for marks, levels in tried
-                 if (every := steady_pattern(marks, levels, size)) is not None]
+                 for slots, levels in tried
+                 if (every := steady_pattern(slots, levels, size)) is not None]
         if not found:
             return learnt if doubtful else None
         return min(found, key=lambda item: item.scatter)

@@ -104,7 +104,7 @@ def index_of(steps: IntArray) -> int:
 
 
 class EvenTarget:
-    """Equal or nearly equal angles: several intervals that follow each other are a lock."""
+    """So many `marks` at equal or nearly equal angles: several intervals in a row are a lock."""
 
     memory = 64
 
