@@ -110,7 +110,7 @@ class Loop:
 
     @property
     def verdict(self) -> str:
-        """Return `none`, `traced` or `unexplained`; with several shafts the last that occurs."""
+        """Return the verdict; with several shafts the worst: `unexplained`, then `traced`."""
         return max((trace.verdict for trace in self.traces.values()), key=_VERDICTS.index)
 
     @property

@@ -51,7 +51,7 @@ def waveform_parts(means: Sequence[BlockMean]) -> WaveformParts | None:
     """
     Return `PARTS` parts of about equal size of consecutive `means` (angle, channel).
 
-    None if there are fewer means.
+    None if there are fewer means, or a part stays empty because others hold most of the cycles.
     """
     ends = np.cumsum([mean.count for mean in means])
     if len(means) < PARTS:

@@ -40,7 +40,8 @@ from sa_jitter_ros.samples import SampleBlock
 #: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here; `skipped` are the
 #: discarded ones since the pulse before, 0 if their number is not known. `epoch` is how often time
 #: ran back before; `elapsed` the time (s) since the first pulse, without the steps back. `mark` is
-#: that of the target where its geometry is known and not all taken from the time yet, else -1.
+#: numbering * teeth + tooth (`TriggerPulses.mark`), -1 where the geometry of the target is not
+#: known, or `RecoveredMarks` has taken the last of it from the time.
 TRIGGER = np.dtype([('time', np.float64), ('elapsed', np.float64), ('epoch', np.int64),
                     ('skipped', np.int64), ('starts_run', np.bool_), ('mark', np.int64)])
 

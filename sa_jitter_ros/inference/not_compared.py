@@ -94,15 +94,17 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
     names = [item.name for item in found]
     tested = {*names, *(item.name for item in tried)}
     not_testable = {name: reason for name in EFFECTS if name not in tested}
-    left_over = unexplained_text(observation, most, harmful, unsteady)
     return Trace(
-        observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
-        tuple(present), tuple(without_harmful(tried, harmful)), UNDEFINED, UNDEFINED,
-        np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None, float('nan'), rows,
-        tuple(row.name for row in rows if row.name in undecided),
-        probabilities(tried, None, names, not_testable), reason, noise, gain=gained,
-        remains=left_over, unsteady=unsteady, not_testable=not_testable,
-        clock=NO_CLOCK if bench is None else bench.clock)
+        observation=observation, declared=tuple(declared), lines=Lines(none, none),
+        level=np.zeros(0), fit=fit, held_out=held_out, findings=tuple(found),
+        present=tuple(present), candidates=tuple(without_harmful(tried, harmful)),
+        before=UNDEFINED, after=UNDEFINED, attenuation=np.zeros((count, 0)),
+        amplitude=np.zeros((count, 0)), prediction_before=nothing, prediction_after=nothing,
+        evidence=None, unsteadiness=float('nan'), noise=noise, gain=gained, limits=rows,
+        undecided=tuple(row.name for row in rows if row.name in undecided),
+        probabilities=probabilities(tried, None, names, not_testable), not_compared=reason,
+        remains=unexplained_text(observation, most, harmful, unsteady), unsteady=unsteady,
+        not_testable=not_testable, clock=NO_CLOCK if bench is None else bench.clock)
 
 
 def unresolved(observation: Observation) -> str:

@@ -192,7 +192,7 @@ def good_lines(averages: Sequence[ReceivedAverage], chosen: Array) -> Array:
 
 
 def places(orders: Array, among: Array) -> Array:
-    """Return where each of some orders is among others."""
+    """Return where each order (n,) is among others (m,), which hold it: the nearest is taken."""
     return np.asarray(np.argmin(np.abs(orders[:, None] - among), axis=1))
 
 

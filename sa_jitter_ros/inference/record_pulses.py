@@ -40,12 +40,12 @@ class RecordPulses:
 
     `times` (n,) in s are the measured ones; `missing` (n - 1,) is the number of trigger pulses
     that are missing in each interval, `displaced` (n - 1,) that of those among them that came, but
-    so far from their place that they were dropped. `starts_run` (n,): the number of trigger cycles
-    since the pulse before is uncertain. `doubtful` (n,): a double pulse next to this one was
-    dropped, and this one may be the wrong one. `bridged` (m,), m = n + the missing ones, are the
-    times with missing pulses interpolated, `reference` (m,) those of a reference keyphasor (None
-    without one); both are NaN where there is no pulse. `remarks` say how pulses were repaired. The
-    marks are counted from `ahead` trigger pulses before the first one.
+    so far from their place that they were dropped. `starts_run` (n,): no trigger cycle ends here.
+    `doubtful` (n,): a double pulse next to this one was dropped, and this one may be the wrong
+    one. `bridged` (m,), m = n + the missing ones, are the times with missing pulses interpolated,
+    `reference` (m,) those of a reference keyphasor (None without one); both are NaN where there is
+    no pulse. `remarks` say how pulses were repaired. The marks are counted from `ahead` trigger
+    pulses before the first one.
     """
 
     times: FloatArray

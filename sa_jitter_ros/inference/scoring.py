@@ -39,6 +39,8 @@ from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
+#: Acquisitions that fitting and scoring take: of so many, two fit and two are held out.
+FEWEST_ACQUISITIONS = 4
 _HELD_OUT = 6  # acquisitions: up to half of few ones, a third of many
 _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
@@ -217,7 +219,9 @@ class Bench:
         Return the residual of the held-out acquisitions.
 
         The others measured levels and parameters, whose errors the held-out ones share: amplitudes
-        whose variance is estimated scatter as Student's variable does.
+        whose variance is estimated scatter as Student's variable does: of nu degrees of freedom,
+        nu / (nu - 2) times the variance. `doubt` is 2 / nu, the squared relative error of the
+        variance, so that doubt / (1 - doubt) of it is added; at most as much as it is, of nu = 4.
         """
         attenuation, variance, amplitude = self.observed(self.held_out)
         level = self._level_variance(effects, unsteadiness)
@@ -235,7 +239,7 @@ class Bench:
                                   / (expected.attenuation_variance + variance))),
                     float(np.mean(wider))))
         if findings:
-            doubt = min(doubt, 2.0 / _FREEDOM)  # 2 over the degrees of freedom of the variance
+            doubt = min(doubt, 2.0 / _FREEDOM)
             level = level + sum(item.mean**2 for item in moved) + (
                 doubt / (1.0 - doubt) * expected.amplitude_variance.mean(axis=0))
             expected = self.expect(effects, self.held_out,

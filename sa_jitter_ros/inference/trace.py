@@ -20,7 +20,7 @@ others. The result may be that no effect explains the residual.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -32,7 +32,7 @@ from sa_jitter_ros.effects.target_geometry import marks_ahead, TargetGeometry
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
-from sa_jitter_ros.inference.gate import passed
+from sa_jitter_ros.inference.gate import passed, ScoreGain
 from sa_jitter_ros.inference.gathering import choose_lines
 from sa_jitter_ros.inference.limits import (
     limits, probabilities, published_change, undecided_effects)
@@ -40,20 +40,20 @@ from sa_jitter_ros.inference.not_compared import nothing_compared, unresolved, U
 from sa_jitter_ros.inference.observation import CHANCE, Observation, together
 from sa_jitter_ros.inference.refinements import with_its_noise, with_its_ticks
 from sa_jitter_ros.inference.remainder import (
-    predicting, scored, SPEED, surest_text, unexplained_check, unexplained_text,
+    predicting, scored, Scores, SPEED, surest_text, unexplained_check, unexplained_text,
     without_absorbing, without_harmful)
-from sa_jitter_ros.inference.scoring import Bench, make_bench
+from sa_jitter_ros.inference.scoring import Bench, FEWEST_ACQUISITIONS, make_bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_choice import RATIO
 from sa_jitter_ros.inference.trace_result import Trace
+from sa_jitter_ros.inference.unsteady import UnsteadyLine
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
 Progress = Callable[[str], None]
 _REFINES = 'its clock is the declared one: it refines the declared model (declared_changes)'
-_TAKEN = 'it is declared, and nothing tells whether it is there: it is taken as declared'
-_FEWEST = 4
-_AS_DECLARED = 'it is declared, and shows no other numbers than these'
+_TAKEN = 'declared; this recording cannot show it, so it is kept as declared'
+_AS_DECLARED = 'declared, and the recording agrees with its declared numbers'
 
 
 def trace(observations: Sequence[Observation], recordings: Sequence[Recording], *,
@@ -71,9 +71,9 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
         require_acquisitions(whole)
     except ModelError as error:
         return nothing_compared(whole, declared, f'no line is compared: {error}')
-    if len(whole.compared) < _FEWEST:
+    if len(whole.compared) < FEWEST_ACQUISITIONS:
         known = np.isfinite(whole.stacked('errors')).all(axis=1)
-        shows = np.count_nonzero(known) >= _FEWEST and choose_lines(whole).count
+        shows = np.count_nonzero(known) >= FEWEST_ACQUISITIONS and choose_lines(whole).count
         bench = make_bench(whole, observations, recordings, declared) if shows else None
         return nothing_compared(whole, declared, unresolved(whole), bench)
     used = [(replace(item, acquisitions=tuple(item.acquisitions[a] for a in item.compared)), source
@@ -122,12 +122,12 @@ def _counted_anew(effect: Effect, observations: Sequence[Observation]) -> Effect
 def require_acquisitions(observation: Observation) -> None:
     """Raise ModelError for fewer than 4 acquisitions."""
     count = len(observation.acquisitions)
-    if count < _FEWEST:
+    if count < FEWEST_ACQUISITIONS:
         cycles = observation.model.trigger_cycles
         remedy = 'lower trigger_cycles or record longer' if cycles > CHANCE + 1 else (
             'record longer')  # fewer cycles tell no coherence
         raise ModelError(f'{count} acquisitions of {cycles} trigger cycles: fitting and scoring '
-                         f'take at least {_FEWEST}; {remedy}')
+                         f'take at least {FEWEST_ACQUISITIONS}; {remedy}')
 
 
 def timing_of(bench: Bench) -> Timing | None:
@@ -135,67 +135,110 @@ def timing_of(bench: Bench) -> Timing | None:
     return read_timing(stretches(bench.observation, bench.fit, bench.clock), bench.declared)
 
 
+@dataclass(frozen=True)
+class _Found:
+    """What the search found: effects that change an average, others, and what was tried."""
+
+    bench: Bench
+    chosen: list[Finding]
+    present: Sequence[Finding]
+    refinements: Sequence[Finding]
+    candidates: list[Candidate]
+
+    @property
+    def every(self) -> list[Finding]:
+        """Return all findings: the chosen ones, the present ones and refinements."""
+        return [*self.chosen, *self.present, *self.refinements]
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """What held-out acquisitions leave of the search, their scores, and what remains."""
+
+    found: _Found
+    scores: Scores
+    gain: ScoreGain
+    remains: str
+    unsteady: tuple[UnsteadyLine, ...]
+
+
 def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | None = None
                 ) -> Trace:
     """Trace the residual of the observations of a bench that have this `timing`."""
-    observation, declared = bench.observation, bench.declared
-    everything = range(len(observation.acquisitions))
+    observation, everything = bench.observation, range(len(bench.observation.acquisitions))
     say = progress or (lambda text: None)
-    known = {item.name for item in declared}
+    as_declared = bench.score((), unsteadiness=bench.unsteadiness(()))
+    say(f'declared model: RMS residual {as_declared.rms:.4f}')
+    refined, noise = with_its_noise(_with_its_growth(bench, timing))
+    if noise is not None:
+        say(f'noise of {noise[0]:.3g} per sample, '
+            + ('less than declared' if observation.model.noise_is_declared else 'not declared'))
+    whole = timing and refitted(timing, stretches(observation, everything, refined.clock),
+                                refined.declared)
+    checked = _check(_search(refined, timing, whole, say), whole)
+    found, scores, own = checked.found, checked.scores, checked.scores.unsteadiness
+    effects, few = effects_of(found.chosen), partial(found.bench.change, chosen=found.bench.few)
+    evidence = found.bench.gather((), everything)
+    rows = limits(timing, evidence, [item.name for item in found.every])
+    not_testable = {**found.bench.unidentifiable, **_without_timing(timing)}
+    candidates = (*found.candidates, *_not_tried(
+        found.bench, timing, found.candidates, {item.name for item in bench.declared}))
+    final, first = tuple(_on_all(found.bench, whole, found.every)), len(found.chosen)
+    attenuation, _, amplitude = scores.bench.observed(everything)
+    return Trace(
+        observation=observation, declared=bench.declared, lines=found.bench.lines,
+        level=found.bench.level, fit=found.bench.fit, held_out=found.bench.held_out,
+        findings=final[:first], present=final[first:first + len(found.present)],
+        refinements=final[first + len(found.present):], candidates=candidates,
+        before=scores.before, after=scores.after, as_declared=as_declared,
+        attenuation=attenuation, amplitude=amplitude,
+        prediction_before=scores.bench.expect((), everything, unsteadiness=own),
+        prediction_after=scores.bench.expect(effects, everything, unsteadiness=own),
+        evidence=evidence, unsteadiness=own, noise=noise, gain=checked.gain, limits=rows,
+        undecided=(*undecided_effects(few, effects, rows),
+                   *(item.name for item in found.bench.assumed)),
+        probabilities=probabilities(
+            candidates, timing, [item.name for item in found.chosen], not_testable),
+        remains=checked.remains, unsteady=checked.unsteady, not_testable=not_testable,
+        clock=found.bench.clock)
+
+
+def _search(bench: Bench, timing: Timing | None, whole: Timing | None, say: Progress) -> _Found:
+    """Return what the timing, of a part and of the `whole` recording, and the lines show."""
+    known = {item.name for item in bench.declared}
 
     def tell(found: Sequence[Finding]) -> None:
         for finding in found:
             what = 'other numbers of ' if finding.name in known else ''
             say(f'found {what}{finding.name}: {finding.evidence}')
 
-    as_declared = bench.score((), unsteadiness=bench.unsteadiness(()))
-    say(f'declared model: RMS residual {as_declared.rms:.4f}')
-    bench, noise = with_its_noise(_with_its_growth(bench, timing))
-    if noise is not None:
-        say(f'noise of {noise[0]:.3g} per sample, '
-            + ('less than declared' if observation.model.noise_is_declared else 'not declared'))
-    whole = timing and refitted(timing, stretches(observation, everything, bench.clock),
-                                bench.declared)
-    chosen, present = _of_timing(bench, timing, whole)
-    bench, refinements, chosen, present = with_its_ticks(bench, chosen, present)
+    bench, refinements, chosen, present = with_its_ticks(bench, *_of_timing(bench, timing, whole))
     tell(chosen)
-    candidates = _of_findings(chosen, present, refinements)
     tried = candidates_of_lines(bench, chosen)
-    candidates += tried
     added = [item.finding for item in tried if not item.rejected_because]
     tell(added)
-    chosen += added
-    present += [item.finding for item in tried
-                if item.rejected_because and item.finding.effect is not None]
-    evidence = bench.gather((), everything)
-    scores = scored(bench, chosen)
-    left = unexplained_check(scores.bench, whole, chosen)
+    small = [item.finding for item in tried
+             if item.rejected_because and item.finding.effect is not None]
+    return _Found(bench, [*chosen, *added], [*present, *small], refinements,
+                  [*_of_findings(chosen, present, refinements), *tried])
+
+
+def _check(found: _Found, whole: Timing | None) -> _Checked:
+    """Drop what held-out acquisitions contradict, and return what remains without it."""
+    scores = scored(found.bench, found.chosen)
+    left = unexplained_check(scores.bench, whole, found.chosen)
     significant = left is not None or scores.after.significant
-    certain, candidates = without_absorbing(scores, left, chosen, candidates)
-    scores = scores if len(certain) == len(chosen) else scored(bench, certain)
-    chosen, harmful, gained = passed(certain, predicting(scores.bench, scores.unsteadiness))
-    candidates = without_harmful(candidates, harmful)
-    scores, effects = scored(bench, chosen) if harmful else scores, effects_of(chosen)
-    unsteady = scores.bench.unsteady_lines(effects)
+    certain, candidates = without_absorbing(scores, left, found.chosen, found.candidates)
+    if len(certain) < len(found.chosen):
+        scores = scored(found.bench, certain)
+    chosen, harmful, gain = passed(certain, predicting(scores.bench, scores.unsteadiness))
+    if harmful:
+        scores = scored(found.bench, chosen)
+    unsteady = scores.bench.unsteady_lines(effects_of(chosen))
     most = surest_text(left, scores, unsteady) if significant else ''
-    left_over = unexplained_text(observation, most, harmful, unsteady)
-    attenuation, _, amplitude = scores.bench.observed(everything)
-    rows = limits(timing, evidence, [item.name for item in (*chosen, *present, *refinements)])
-    assumed = [item.name for item in bench.assumed]
-    not_testable = {**bench.unidentifiable, **_without_timing(timing)}
-    candidates += _not_tried(bench, timing, candidates, known)
-    final = tuple(_on_all(bench, whole, [*chosen, *present, *refinements]))
-    few, own = partial(bench.change, chosen=bench.few), scores.unsteadiness
-    return Trace(
-        observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
-        final[:len(chosen)], final[len(chosen):len(chosen) + len(present)], tuple(candidates),
-        scores.before, scores.after, attenuation,
-        amplitude, scores.bench.expect((), everything, unsteadiness=own),
-        scores.bench.expect(effects, everything, unsteadiness=own), evidence, own, rows,
-        (*undecided_effects(few, effects, rows), *assumed),
-        probabilities(candidates, timing, [item.name for item in chosen], not_testable), '', noise,
-        final[len(chosen) + len(present):], as_declared, gained, left_over, unsteady, not_testable,
-        bench.clock)
+    return _Checked(
+        replace(found, chosen=chosen, candidates=without_harmful(candidates, harmful)), scores,
+        gain, unexplained_text(found.bench.observation, most, harmful, unsteady), unsteady)
 
 
 def _with_its_growth(bench: Bench, timing: Timing | None) -> Bench:
@@ -212,9 +255,15 @@ def _with_its_growth(bench: Bench, timing: Timing | None) -> Bench:
 def _of_findings(chosen: Sequence[Finding], present: Sequence[Finding],
                  refinements: Sequence[Finding]) -> list[Candidate]:
     """Return findings on the timing as candidates: those that are chosen, and others."""
-    return [*(Candidate(item.name, 0, item, None, '') for item in chosen),
-            *(Candidate(item.name, 0, item, None, too_small(item)) for item in present),
-            *(Candidate(item.name, 0, item, None, _REFINES) for item in refinements)]
+    return [*(_unscored(item, '') for item in chosen),
+            *(_unscored(item, too_small(item)) for item in present),
+            *(_unscored(item, _REFINES) for item in refinements)]
+
+
+def _unscored(finding: Finding, reason: str) -> Candidate:
+    """Return the candidate of a finding that the lines do not score, and why it is not named."""
+    return Candidate(finding.name, stage=0, finding=finding, held_out_score=None,
+                     rejected_because=reason)
 
 
 def _not_tried(bench: Bench, timing: Timing | None, candidates: Sequence[Candidate],
@@ -230,7 +279,7 @@ def _not_tried(bench: Bench, timing: Timing | None, candidates: Sequence[Candida
             reason = 'the likelihood of the timing gains too little by it'
         else:
             reason = bench.unidentifiable.get(name, UNSEEN)
-        found.append(Candidate(name, 0, absent(name, reason), None, reason))
+        found.append(_unscored(absent(name, reason), reason))
     return found
 
 

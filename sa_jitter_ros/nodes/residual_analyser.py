@@ -33,6 +33,7 @@ from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.inference.online import (
     Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
 from sa_jitter_ros.inference.online_trace import trace_averages
+from sa_jitter_ros.inference.scoring import FEWEST_ACQUISITIONS
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (
@@ -57,7 +58,6 @@ PARAMETERS = (
     Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),
 )
 _SIGNIFICANT = 0.02  # p value of a residual that is no chance
-_FEWEST = 4  # averages that a search for the cause takes
 _PERIOD = 0.2  # s between the steps of the loop
 _FIND_TIMEOUT = 3.0  # s to find the predictor
 _ANSWER_TIMEOUT = 15.0  # s for its answer, which comes after a new prediction
@@ -195,10 +195,10 @@ class ResidualAnalyser(MonitoringNode):
         self.set_missing('residual', '')
         ambiguous = sum(values is not None and not _resolved(values) for values in pulses)
         few = ''
-        if len(averages) < _FEWEST:
-            few = (f'{len(averages)} averages at once tell no cause, at least {_FEWEST} do: raise '
-                   'acquisitions')
-        elif len(averages) - ambiguous < _FEWEST:
+        if len(averages) < FEWEST_ACQUISITIONS:
+            few = (f'{len(averages)} averages at once tell no cause, at least '
+                   f'{FEWEST_ACQUISITIONS} do: raise acquisitions')
+        elif len(averages) - ambiguous < FEWEST_ACQUISITIONS:
             few = (f'{ambiguous} of {len(averages)} averages have pulses whose error the '
                    'vibration leaves ambiguous, and tell no cause: declare stronger or lower '
                    'orders in the averager, or use a better keyphasor')

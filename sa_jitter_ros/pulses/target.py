@@ -46,7 +46,9 @@ _ACROSS_GAP = 0.9  # teeth
 @dataclass(frozen=True)
 class Lock:
     """
-    How the latest pulses fit a target, from pulse number `first` on, which is tooth `slot`.
+    How the latest pulses fit a target, from pulse number `first` on.
+
+    That pulse is number `slot` of the teeth present (`tooth`: counted with the missing ones).
 
     For every tooth present (m,), counted from the index: `steps` to the next one in teeth, and
     `widths`, the steps with what is known of uneven marks. Deviations of the interval behind it
