@@ -31,11 +31,11 @@ from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.effects import declared_effects
 from sa_jitter_ros.errors import DataWarning, ModelError, RecordingError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
-from sa_jitter_ros.inference.record_pulses import SAME_RATIO
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.keyphasor_check.machine_file import on_target
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
+from sa_jitter_ros.parameters import SAME_RATIO
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording

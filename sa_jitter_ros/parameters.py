@@ -177,6 +177,9 @@ def listed(values: Iterable[float], digits: int = 4) -> str:
     return ', '.join(texts if len(texts) <= 6 else [*texts[:4], '...', texts[-1]])
 
 
+#: Relative difference of ratios that are the same: users give six digits, which are as near to any
+#: ratio. Gears of other teeth differ by more.
+SAME_RATIO = 1e-5
 #: Beyond this range one shaft hardly turns during an average of the other.
 RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest over that of the tach shaft',
                   minimum=1e-3, maximum=1e3)

@@ -53,8 +53,8 @@ CORE = {
     'tacholess': SCIENCE | {
         'averaging', 'errors', 'machine', 'parameters', 'pulses', 'recordings'},
     'inference': SCIENCE | {
-        'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
-        'samples'},
+        'averaging', 'effects', 'errors', 'number_text', 'parameters', 'prediction', 'pulses',
+        'recordings'},
     'monitoring': SCIENCE | {
         'averaging', 'errors', 'json_values', 'machine', 'number_text', 'parameter_file',
         'parameters', 'whole_files'},
@@ -69,8 +69,8 @@ CORE = {
         'averaging', 'effects', 'errors', 'html_parts', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
     'loop': {
-        'arrays', 'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
-        'pulses', 'recordings', 'report', 'whole_files'},
+        'arrays', 'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'parameters',
+        'prediction', 'pulses', 'recordings', 'report', 'whole_files'},
 }
 ROOMS = {
     **CORE,

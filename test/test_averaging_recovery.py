@@ -15,7 +15,7 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
-from sa_jitter_ros.averaging.pulse_chain import shortest_path, Tridiagonal
+from sa_jitter_ros.averaging.neighbour_equations import shortest_path, Tridiagonal
 from sa_jitter_ros.averaging.pulse_error_fit import _CHANCES, _SIZES, estimated_size
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
 from sa_jitter_ros.errors import ParameterError, SignalError

@@ -261,7 +261,7 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
         record_pulses(recording, model)
         if recording.samples * recording.channels > 20_000:  # of all the loop is slow
             seen = recording.keyphasor_pulses()
-            last = int(2.0 * model.trigger_cycles * model.trigger_revolutions
+            last = int(2.0 * model.trigger_cycles * model.revolutions_per_trigger
                        * model.pulses_per_revolution)
             recording = cut(recording, seen[min(last, seen.size - 1)] - recording.start_time)
             seen = recording.keyphasor_pulses(duration=recording.duration)

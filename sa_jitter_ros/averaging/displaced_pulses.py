@@ -21,6 +21,7 @@ import numpy as np
 from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery
+from sa_jitter_ros.pulses.mark_pattern import OF_MEDIAN
 
 #: Error of a pulse, over a trigger cycle, up to which it is searched for.
 REACH = 0.15
@@ -49,7 +50,7 @@ def displacements(grid: FloatArray, recovery: PulseErrorRecovery, raw: Average, 
     begins, to_cycles = np.flatnonzero(raw.used), cycle_length / float(np.mean(raw.periods))
     errors = recovery.expected * to_cycles
     known = recovery.errors[recovery.resolved] * to_cycles
-    usual = 1.4826 * float(np.median(np.abs(known))) if known.size else 0.0
+    usual = OF_MEDIAN * float(np.median(np.abs(known))) if known.size else 0.0
     limit = _JITTER * np.hypot(max(usual, declared * to_cycles), np.nan_to_num(
         recovery.standard_errors) * to_cycles)
     misfit = fit.misfit(np.arange(begins.size), errors[begins], errors[begins + 1])

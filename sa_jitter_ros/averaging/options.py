@@ -25,13 +25,12 @@ from typing import Any, Literal, TypedDict, TypeVar
 from sa_jitter_ros.averaging.average import AverageSettings, KeyphasorParameters
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine
-from sa_jitter_ros.parameters import number, RATIO
+from sa_jitter_ros.parameters import number, RATIO, SAME_RATIO
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
 
 Averaging = Literal['block', 'sliding', 'exponential']
 AngleLawName = Literal['linear', 'quadratic', 'spline']
 Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
-_SAME_RATIO = 1e-4  # relative, by which a ratio that was typed may differ
 FunctionT = TypeVar('FunctionT', bound=Callable[..., object])
 
 
@@ -122,7 +121,7 @@ def _of_machine(machine: Machine, shaft: str | None, given: Mapping[str, Any]) -
     if shaft is None:
         ratio = number('ratio', given['ratio'])
         shaft = next((name for name in machine.shafts
-                      if abs(machine.ratio(name) - ratio) < _SAME_RATIO * ratio), '')
+                      if abs(machine.ratio(name) - ratio) < SAME_RATIO * ratio), '')
         if not shaft:
             turning = ', '.join(f'{name} {machine.ratio(name):.6g}' for name in machine.shafts)
             raise ParameterError(f'ratio is {ratio:.6g}, with which no shaft of the machine turns '

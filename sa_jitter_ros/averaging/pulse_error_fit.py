@@ -39,7 +39,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
-from sa_jitter_ros.averaging.pulse_chain import shortest_path, Tridiagonal
+from sa_jitter_ros.averaging.neighbour_equations import shortest_path, Tridiagonal
 from scipy.linalg import lapack, qr
 
 _NODE_ERROR = 1e-4

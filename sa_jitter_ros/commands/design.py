@@ -124,7 +124,7 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
 def table(found: Design, options: argparse.Namespace) -> str:
     """Return the settings, and loss and variation of each order, as lines."""
     model = found.model
-    revolutions = model.trigger_cycles * model.trigger_revolutions
+    revolutions = model.trigger_cycles * model.revolutions_per_trigger
     rate = ('given' if options.keyphasor_rate is not None
             else f'chosen for a loss of at most {options.maximum_loss:g}')
     cycles = ('given' if options.trigger_cycles is not None

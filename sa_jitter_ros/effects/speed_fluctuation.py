@@ -107,4 +107,4 @@ def _unit_covariance(weights: PulseWeights, cycles: int, band: tuple[float, floa
 
 def _cycles(model: DeclaredModel, acceleration: float) -> float:
     """Return an acceleration in rad/s^2 of the tach shaft in trigger cycles/s^2."""
-    return acceleration / (2.0 * np.pi * model.trigger_revolutions)
+    return acceleration / (2.0 * np.pi * model.revolutions_per_trigger)

@@ -91,7 +91,7 @@ class TargetGeometry(Effect):
 
     def _at(self, model: DeclaredModel, index: Array) -> Array:
         """Return the errors in s of the trigger pulses `index`."""
-        step = model.pulses_per_trigger or model.pulses_per_revolution
+        step = model.pulses_in_trigger_cycle
         angles = np.asarray(self.pulse_angles)[index * step % len(self.pulse_angles)]
         return np.asarray(angles / (2.0 * np.pi * model.trigger_speed))
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.averaging.pulse_chain import Tridiagonal
+from sa_jitter_ros.averaging.neighbour_equations import Tridiagonal
 from scipy.linalg import cho_factor, cho_solve
 
 

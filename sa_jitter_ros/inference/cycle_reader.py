@@ -60,7 +60,7 @@ class CycleReader:
         return ShaftAverager(AverageSettings(
             cycle_length=model.cycle_length, trigger_cycles=cycles.count,
             orders=tuple(orders.tolist()), angle_law=law.name, interpolation=METHOD,
-            revolutions_per_trigger=model.trigger_revolutions)).amplitudes(cycles)
+            revolutions_per_trigger=model.revolutions_per_trigger)).amplitudes(cycles)
 
 
 def kept_apart(cycle_length: float, orders: FloatArray) -> bool:

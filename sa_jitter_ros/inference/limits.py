@@ -8,9 +8,6 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-# The name is that of the concept; a module in a package hides no builtin one.
-# flake8: noqa: A005
-
 """
 Limits: how large an effect that was not found could still be, at 95 %.
 

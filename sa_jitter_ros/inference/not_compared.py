@@ -16,6 +16,7 @@ from functools import cache, partial
 
 import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.amplitude_modulation import AmplitudeModulation
 from sa_jitter_ros.effects.effect import DirectEffect, effects_of, Finding
 from sa_jitter_ros.effects.lattice import NO_CLOCK
 from sa_jitter_ros.inference.candidates import Candidate, candidates_of_lines
@@ -27,7 +28,7 @@ from sa_jitter_ros.inference.limits import (
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.refinements import with_its_noise
 from sa_jitter_ros.inference.remainder import (
-    _GAIN, predicting, single_events, unexplained_text, without_harmful)
+    predicting, single_events, unexplained_text, without_harmful)
 from sa_jitter_ros.inference.residual import UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench, parted
 from sa_jitter_ros.inference.timing import read_timing, stretches
@@ -56,9 +57,8 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
                          names=frozenset())
     known = [item.name for item in declared]
     noise: tuple[float, float] | None = None
-    gained, harmful, unsteady = NO_GAIN, list[Finding](), tuple[UnsteadyLine, ...]()
-    tried: list[Candidate] = []
-    most = ''
+    gained, harmful, most = NO_GAIN, list[Finding](), ''
+    tried, unsteady = list[Candidate](), tuple[UnsteadyLine, ...]()
 
     @cache
     def predicted(effects: tuple[Effect, ...]) -> Prediction:
@@ -82,7 +82,8 @@ def nothing_compared(observation: Observation, declared: Sequence[Effect], reaso
         found = [item.finding for item in tried if not item.rejected_because]
         events = single_events(bench, found)
         if events is not None:
-            found, most = [item for item in found if item.name != _GAIN], events.text
+            most = events.text
+            found = [item for item in found if item.name != AmplitudeModulation.name]
         found, harmful, gained = passed(
             found, predicting(bench, bench.unsteadiness(effects_of(found))))
         unsteady = bench.unsteady_lines(effects_of(found))

@@ -220,7 +220,7 @@ def observe(recording: Recording, model: DeclaredModel, *, sources: Sequence[flo
                          f'has {recording.sample_rate:g} Hz: declare {recording.sample_rate:g}')
     once = tuple(dict.fromkeys(float(g) for g in model.orders))  # each order once
     pulses, declared_speed = record_pulses(recording, model), model.trigger_speed
-    speed = model.trigger_revolutions / mean_period(pulses.times, pulses.missing)
+    speed = model.revolutions_per_trigger / mean_period(pulses.times, pulses.missing)
     model = replace(model, sample_rate=recording.sample_rate, orders=once, trigger_speed=speed)
     samples, gaps = _read(recording)
     pulses = pulses.broken_at(gaps, recording.start_time, recording.sample_rate, MARGIN)

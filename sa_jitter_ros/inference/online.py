@@ -23,6 +23,7 @@ from sa_jitter_ros.inference.expectation import RESOLUTION
 from sa_jitter_ros.inference.observation import STRONG
 from sa_jitter_ros.inference.record_pulses import SPEED_TOLERANCE
 from sa_jitter_ros.inference.residual import Residual, residual
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.special import ndtr
 
@@ -123,8 +124,8 @@ def require_comparable(averages: Sequence[ReceivedAverage], published: Published
                          'follow_shaft_speed of the predictor')
     if not _common(averages, published).size:
         raise ModelError(
-            f'averages have the orders {named(last.orders)} and the prediction '
-            f'{named(published.order)}: give averager and predictor orders in common')
+            f'averages have the orders {listed(last.orders, 6)} and the prediction '
+            f'{listed(published.order, 6)}: give averager and predictor orders in common')
 
 
 def compare(averages: Sequence[ReceivedAverage], published: Published) -> tuple[Array, Residual]:
@@ -185,20 +186,15 @@ def good_lines(averages: Sequence[ReceivedAverage], chosen: Array) -> Array:
     good = np.isfinite(attenuation).all(axis=0) & (noise <= _NOISE * level)
     good &= level >= STRONG * np.where(good, level, 0.0).max(axis=0)
     if not good.any():
-        raise SignalError(f'none of the orders {named(averages[-1].orders[chosen])} stands ten '
-                          'times above its noise on any channel: average more trigger cycles, '
-                          'or other orders')
+        raise SignalError(f'none of the orders {listed(averages[-1].orders[chosen], 6)} stands '
+                          'ten times above its noise on any channel: average more trigger '
+                          'cycles, or other orders')
     return np.asarray(good)
 
 
 def places(orders: Array, among: Array) -> Array:
     """Return where each order (n,) is among others (m,), which hold it: the nearest is taken."""
     return np.asarray(np.argmin(np.abs(orders[:, None] - among), axis=1))
-
-
-def named(orders: Array) -> str:
-    """Return orders as a text."""
-    return ', '.join(f'{order:g}' for order in orders)
 
 
 def _share(average: ReceivedAverage) -> Fraction:

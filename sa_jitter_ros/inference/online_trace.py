@@ -29,12 +29,13 @@ from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.gathering import clock_of, of_acquisitions
 from sa_jitter_ros.inference.observation import Acquisition, nameless, NameOf, Observation
-from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
+from sa_jitter_ros.inference.online import good_lines, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.trace import (
     require_acquisitions, timing_of, trace_bench)
 from sa_jitter_ros.inference.trace_result import Trace
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -112,8 +113,8 @@ def _observation(averages: Sequence[ReceivedAverage], model: DeclaredModel) -> O
     kept = [int(np.argmin(np.abs(measured - order))) for order in dict.fromkeys(model.orders)
             if np.isclose(measured, order, rtol=1e-6).any()]
     if not kept:
-        raise ModelError(f'averages have the orders {named(measured)}, none of which is declared: '
-                         'declare orders of the averager in the predictor')
+        raise ModelError(f'averages have the orders {listed(measured, 6)}, none of which is '
+                         'declared: declare orders of the averager in the predictor')
     count = averages[0].trigger_cycles
     found, times = [], []
     for number, item in enumerate(averages):

@@ -17,6 +17,7 @@ import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.parameters import SAME_RATIO
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.recordings.recording import Recording
@@ -27,8 +28,6 @@ _SPEEDS = 0.05  # share of the cycles that are faster than the speeds of a run-u
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
-#: Relative difference of ratios that are the same: users give six digits.
-SAME_RATIO = 1e-5
 _USUAL = 15  # pulses before a gap that tell how many it hides
 _COVERED = 0.5  # of the pulses, by those of a reference keyphasor
 
@@ -128,7 +127,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
                          f'the recording says {recording.pulses_per_revolution}: declare '
                          'that of this machine')
-    step = model.pulses_per_trigger or model.pulses_per_revolution
+    step = model.pulses_in_trigger_cycle
     # As the keyphasor was sampled: the jitter of its sampling is part of the declared model.
     measured = recording.keyphasor_pulses(interpolate=False)
     if measured.size < _FEWEST:
@@ -151,7 +150,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if found.times.size < _FEWEST or not np.any(found.missing == 0):
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
                              f'pulses: the loop needs {_FEWEST} in a row; record longer')
-    slow, middle, fast = model.trigger_revolutions / np.quantile(
+    slow, middle, fast = model.revolutions_per_trigger / np.quantile(
         np.diff(found.times)[found.missing == 0], (1.0 - _SPEEDS, 0.5, _SPEEDS))
     if not slow * (1.0 - SPEED_TOLERANCE) <= model.trigger_speed <= fast * (1.0 + SPEED_TOLERANCE):
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '

@@ -14,7 +14,9 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from sa_jitter_ros.effects.amplitude_modulation import AmplitudeModulation
 from sa_jitter_ros.effects.effect import Effect, effects_of, Finding
+from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import Pattern, PULSES
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.clock_steps import steps_text
@@ -29,8 +31,6 @@ from sa_jitter_ros.inference.trace_result import HARMS
 from sa_jitter_ros.inference.unsteady import unsteady_text, UnsteadyLine
 from sa_jitter_ros.prediction.amplitudes import line_variance
 
-SPEED = 'speed_fluctuation'
-_GAIN = 'amplitude_modulation'
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
 _MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
@@ -105,14 +105,15 @@ def unexplained_check(bench: Bench, timing: Timing | None, chosen: Sequence[Find
     effects = bench.with_declared(effects_of(chosen))
     names = {effect.name for effect in effects}
     of_timing = timing.checks if timing is not None else ()
-    speeds = model.trigger_revolutions / bench.observation.periods
+    speeds = model.revolutions_per_trigger / bench.observation.periods
     explained = np.mean([line_variance(replace(model, trigger_speed=speed), effects)
                          for speed in speeds.tolist()], axis=0)
     of_lines = (*check_lines(bench.observation, bench.lines, explained), *_of_gain(bench, names))
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
     left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
         check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
-                              and not (check.direction != PULSES and SPEED in names)))]
+                              and (check.direction == PULSES
+                                   or SpeedFluctuation.name not in names)))]
     return min(left, key=lambda check: check.p_value, default=None)
 
 
@@ -133,7 +134,8 @@ def single_events(bench: Bench, found: Sequence[Finding]) -> Check | None:
 
 def _of_gain(bench: Bench, names: Collection[str]) -> Sequence[Check]:
     """Return the checks of a modulation, if it is one of the `names`."""
-    return (check_gain(bench.scatter), check_channels(bench.scatter)) if _GAIN in names else ()
+    return () if AmplitudeModulation.name not in names else (
+        check_gain(bench.scatter), check_channels(bench.scatter))
 
 
 def unexplained_text(observation: Observation, most: str, harmful: Sequence[Finding],

@@ -18,7 +18,7 @@ the wrong turn. Around cycles that the lines do not fit, errors are chosen anew,
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
-from sa_jitter_ros.averaging.pulse_chain import shortest_path
+from sa_jitter_ros.averaging.neighbour_equations import shortest_path
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import fit_lines
 from scipy.special import gammainccinv

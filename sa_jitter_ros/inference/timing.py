@@ -31,6 +31,7 @@ from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
     beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
+from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.effects.lattice import (
@@ -43,7 +44,7 @@ from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
-    BAND, Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
+    BAND, Choice, Chooser, DECIDED, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
 from sa_jitter_ros.inference.timing_data import (
     ALIASES, FEWEST, Stretch)
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
@@ -52,7 +53,6 @@ from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
-_SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 #: What distinguishes an effect from those that look like it.
 _DECIDING = 'a longer recording, or one at other speeds'
 
@@ -230,7 +230,7 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
 
 def _chosen(findings: Sequence[Finding]) -> Sequence[str]:
     """Return the names of effects; the bends of a speed are found whatever the others are."""
-    return [item.name for item in findings if item.name != _SPEED]
+    return [item.name for item in findings if item.name != SpeedFluctuation.name]
 
 
 def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, float]:
@@ -239,14 +239,14 @@ def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, 
     scaled = found.pop(JITTER, choice.probabilities.get(JITTER, 0.0))
     named = {finding.name for finding in findings}
     shared = any(JITTER in finding.indistinguishable_from for finding in findings)
-    excess = 0.5 if shared else float(EXCESS in named)
-    found[JITTER], found[EXCESS] = (1.0 - excess) * scaled, excess * scaled
+    excess = 0.5 if shared else float(ExcessJitter.name in named)
+    found[JITTER], found[ExcessJitter.name] = (1.0 - excess) * scaled, excess * scaled
     return found
 
 
 def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
     """Return the p value of the likelihood gained by an effect beside the others."""
-    if choice.quantised and name == _CLOCK:
+    if choice.quantised and name == KeyphasorQuantisation.name:
         return 0.0  # the pulse times themselves show it
     without = chooser.fit(choice.best - {name}, choice.fit.starts)
     gain = max(choice.fit.value - without.value, 0.0)
@@ -261,7 +261,7 @@ def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]
             found.append(_of_jitter(chooser, choice, declared))
         elif name not in NO_EFFECTS and (other := _of_effect(chooser, choice, name)):
             found.append(other)
-    if _CLOCK in choice.fit.columns and JITTER not in choice.best:
+    if KeyphasorQuantisation.name in choice.fit.columns and JITTER not in choice.best:
         beside = _beside_the_clock(chooser, choice)
         found += [beside] if beside else []
     if other_clock := _other_clock(chooser):
@@ -280,10 +280,10 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding | None:
     effect, errors = found
     if RATIO in fit.columns and isinstance(effect, ClockSkew):
         effect = _by_angle(effect, fit)
-    rivals = tuple(EXCESS if other == JITTER else other for other in choice.rivals(name)
+    rivals = tuple(ExcessJitter.name if other == JITTER else other for other in choice.rivals(name)
                    if other not in NO_EFFECTS)
     if {RIPPLE, BAND} & {*choice.rivals(name)}:
-        rivals = (*rivals, _SPEED)
+        rivals = (*rivals, SpeedFluctuation.name)
     text = (f'{effect.summary}: {_sizes(effect, errors)}{effect.remark(choice.setting.model)}, '
             'which pulse times and errors recovered from the vibration show')
     return Finding(name, effect, errors, _p_value(choice, name, chooser), text,
@@ -340,11 +340,11 @@ def _of_jitter(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> 
         return Finding(JITTER, JitterScale(scale), {'scale': 0.5 * scale * error}, p_value, text,
                        indistinguishable_from=rivals)
     share = max(1.0 - (least / scale) ** 2, 1e-9)  # of all power
-    effect, errors = EFFECTS[EXCESS].of_timing(
+    effect, errors = EFFECTS[ExcessJitter.name].of_timing(
         np.array([log_power + math.log(share)]), np.array([normal_error / share]), setting)
     if odds > -DECIDED:
         rivals = (JITTER, *rivals)
-    return Finding(EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals)
+    return Finding(ExcessJitter.name, effect, errors, p_value, text, indistinguishable_from=rivals)
 
 
 def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
@@ -358,20 +358,20 @@ def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
     if found is None:
         return None
     effect, errors = found
-    return Finding(EXCESS, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
+    return Finding(ExcessJitter.name, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
                    f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
 
 
 def _other_clock(chooser: Chooser) -> Finding | None:
     """Return the coarsest clock there may be where a declared one cannot have made the pulses."""
-    known = chooser.declared.get(_CLOCK)
-    if not isinstance(known, KeyphasorQuantisation) or _CLOCK in chooser.patterns:
+    known = chooser.declared.get(KeyphasorQuantisation.name)
+    if not isinstance(known, KeyphasorQuantisation) or known.name in chooser.patterns:
         return None
     coarsest = coarsest_clock(chooser.data.pulse_times)
     if coarsest is None or known.clock_rate > (1.0 - SAME_RATE) * coarsest:
         return None
     return Finding(
-        _CLOCK, replace(known, clock_rate=coarsest), {'clock_rate': None}, 0.0,
+        KeyphasorQuantisation.name, replace(known, clock_rate=coarsest), {'clock_rate': None}, 0.0,
         f'the pulse times are on no grid of {known.clock_rate:.6g} Hz, as it is declared; no '
         f'clock slower than {coarsest:.3g} Hz could have made them', gain=-math.inf)
 
@@ -433,7 +433,7 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     if known is not None and not departs(effect, errors, known, data.cycles):
         return None
     return Finding(
-        _SPEED, effect, errors, float(special.ndtr(-certainty)),
+        SpeedFluctuation.name, effect, errors, float(special.ndtr(-certainty)),
         'the speed changes within a trigger cycle: the angle between the pulses errs by '
         f'u (1 - u) times {size:.3g} s',
         gain=gain)

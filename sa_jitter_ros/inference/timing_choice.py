@@ -29,6 +29,7 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, possible, RARE
+from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.phase_wander import PhaseWander
 from sa_jitter_ros.effects.target_geometry import own_marks
@@ -47,8 +48,6 @@ SIDEBANDS = 'sidebands'
 BAND = 'band'
 #: What a wrong ratio makes beside a clock skew of its size: no effect, but a wrong number.
 RATIO = 'ratio'
-#: Independent errors beside the declared jitter, or that of another size.
-EXCESS = 'excess_jitter'
 NO_EFFECTS = RIPPLE, SIDEBANDS, BAND, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
@@ -139,8 +138,8 @@ class Chooser:
     def pool(self) -> Sequence[str]:
         """Return the names of all that may be in a set."""
         names = self.patterns.keys() | self.spectra.keys()
-        if EXCESS not in self.declared:  # jitter of another size
-            names -= {EXCESS}
+        if ExcessJitter.name not in self.declared:  # jitter of another size
+            names -= {ExcessJitter.name}
         return [JITTER, *(name for name in (*EFFECTS, *NO_EFFECTS) if name in names)]
 
     def _columns(self, pattern: Pattern) -> Array | None:
@@ -210,7 +209,7 @@ class Chooser:
         else:  # errors that are within the ticks of a clock
             sizes, errors = np.ones(1), np.zeros((1, 1))
         try:
-            found = EFFECTS[EXCESS if name == JITTER else name].of_timing(
+            found = EFFECTS[ExcessJitter.name if name == JITTER else name].of_timing(
                 sizes, errors, self.setting)
         except ParameterError:
             return None

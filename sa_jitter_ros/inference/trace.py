@@ -28,6 +28,7 @@ from sa_jitter_ros.arrays import IntArray
 from sa_jitter_ros.effects import Effect, EFFECTS, make_effect
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, effects_of, Finding, RARE
+from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.target_geometry import marks_ahead, TargetGeometry
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
@@ -40,13 +41,14 @@ from sa_jitter_ros.inference.not_compared import nothing_compared, unresolved, U
 from sa_jitter_ros.inference.observation import CHANCE, Observation, together
 from sa_jitter_ros.inference.refinements import with_its_noise, with_its_ticks
 from sa_jitter_ros.inference.remainder import (
-    predicting, scored, Scores, SPEED, surest_text, unexplained_check, unexplained_text,
+    predicting, scored, Scores, surest_text, unexplained_check, unexplained_text,
     without_absorbing, without_harmful)
 from sa_jitter_ros.inference.scoring import Bench, FEWEST_ACQUISITIONS, make_bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_choice import RATIO
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.inference.unsteady import UnsteadyLine
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -83,11 +85,10 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
         _counted_alike(item, observations[0]) for item in observations[1:])]
     observation = together(observations)
     if not choose_lines(observation).count:
-        orders = ', '.join(f'{g:g}' for g in observation.orders)
         return nothing_compared(observation, declared, (
-            f'no line is compared: no declared order ({orders}) is coherent from cycle to cycle '
-            'on any channel, so that no effect could have been seen; declare orders that the '
-            'vibration holds'))
+            f'no line is compared: no declared order ({listed(observation.orders, 6)}) is '
+            'coherent from cycle to cycle on any channel, so that no effect could have been seen; '
+            'declare orders that the vibration holds'))
     declared = [_counted_anew(item, observations) for item in declared]
     bench = make_bench(observation, observations, recordings, declared)
     timing = timing_of(bench)
@@ -310,7 +311,7 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
                 again.effect, again.standard_errors, known, whole.chooser.data.cycles):
             continue
         others = effects_of(item for item in findings
-                            if item is not finding and item.name != SPEED)
+                            if item is not finding and item.name != SpeedFluctuation.name)
         effect = finding.effect
         assert effect is not None
         change = bench.change(others, effect)
@@ -326,7 +327,7 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
         elif known or again is None or again.p_value < RARE:
             present.append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
-    return chosen, [item for item in present if item.name != SPEED]
+    return chosen, [item for item in present if item.name != SpeedFluctuation.name]
 
 
 def _on_all(bench: Bench, timing: Timing | None, findings: Sequence[Finding]) -> list[Finding]:

@@ -25,6 +25,7 @@ from sa_jitter_ros.keyphasor_check.teeth import (
     joined_parts, nearest_pulses, number_pulses, NumberedPulses)
 from sa_jitter_ros.keyphasor_check.uneven_wheel import MOST_MARKS, number_marks
 from sa_jitter_ros.keyphasor_check.wheel import Marking, pattern_of, patterns
+from sa_jitter_ros.pulses.mark_pattern import OF_MEDIAN
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 
 _ROUNDS = 2
@@ -279,7 +280,7 @@ def _outliers(pulses: NumberedPulses, late: FloatArray, tick: float) -> NDArray[
         place = _beside(pulses.times[index] - late[index] * pulses.pitch[index],
                         pulses.numbers[index], pulses.pitch[index])
         size = np.abs(place)
-        limit = np.maximum(max(_OUTLIER * 1.4826 * float(np.median(size)), _LEAST),
+        limit = np.maximum(max(_OUTLIER * OF_MEDIAN * float(np.median(size)), _LEAST),
                            2.0 * tick / pulses.pitch[index])
         before, after = np.append(0.0, size[:-1]), np.append(size[1:], 0.0)
         wrong = (size > limit) & (size >= before) & (size >= after)

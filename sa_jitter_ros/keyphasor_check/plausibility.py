@@ -21,6 +21,7 @@ from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import find_lines
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.unit_check import likely_mistake, other_span
 from sa_jitter_ros.pulses.validation import PulseValidator
@@ -153,12 +154,12 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     sizes = lines.logarithms(places)
     stand = sizes > 0.0
     chance = lines.share(0.8 * float(places.min()), 1.2 * float(places.max()))
-    count, listed = int(np.count_nonzero(stand)), ', '.join(f'{order:g}' for order in orders[:6])
+    count, names = int(np.count_nonzero(stand)), listed(orders, 6)
     speed = share * (times.size - 1) / float(np.sum(np.diff(times) / np.diff(numbers)))
     by_chance = float(special.betainc(count, stand.size - count + 1, chance)) if count else 1.0
     if count < stand.size and by_chance > _BY_CHANCE:
         beyond = ' more often than by chance' if count else ''
-        return (f'none of the orders {listed} stands above its noise{beyond} at {speed:.4g} Hz '
+        return (f'none of the orders {names} stands above its noise{beyond} at {speed:.4g} Hz '
                 f'and ratio {ratio:.6g}: check ratio, pulses_per_revolution and sample_rate '
                 '(check_keyphasor finds them), and that one clock times pulses and vibration',)
     marks, larger = validator.pulses_per_revolution, _LARGER if count < stand.size else _FAR_LARGER
@@ -169,7 +170,7 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
         others = lines.logarithms(places / float(other))
         if others.min() > 0.0 and others.sum() > sizes.sum() + larger * sizes.size:
             better = 'all of them do' if count < stand.size else 'they are far larger'
-            return (f'{count} of the orders {listed} stand above their noise at {speed:.4g} Hz '
+            return (f'{count} of the orders {names} stand above their noise at {speed:.4g} Hz '
                     f'and ratio {ratio:.6g}: with pulses_per_revolution {fitting} instead of '
                     f'{marks} {better} (check_keyphasor finds out)',)
     base = round(min(orders))
@@ -179,8 +180,8 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     for miscounted in (base - 1, base + 1, base - 2, base + 2):
         others = lines.logarithms(places * (miscounted / base))
         if np.all(others - sizes > _BESIDE):
-            larger_ones = ', '.join(f'{order * miscounted / base:g}' for order in orders[:6])
-            return (f'the orders {listed} hold no line beside {larger_ones}, each at least '
+            larger_ones = listed([order * miscounted / base for order in orders], 6)
+            return (f'the orders {names} hold no line beside {larger_ones}, each at least '
                     f'{np.exp(_BESIDE):.0f} times as large: are those meant? Count the teeth',)
     return ()
 

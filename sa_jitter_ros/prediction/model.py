@@ -143,20 +143,24 @@ class DeclaredModel:
         return self.ratio * self.trigger_speed
 
     @property
-    def trigger_revolutions(self) -> float:
+    def pulses_in_trigger_cycle(self) -> int:
+        """Return the number of pulses of the keyphasor from trigger to trigger."""
+        return self.pulses_per_trigger or self.pulses_per_revolution
+
+    @property
+    def revolutions_per_trigger(self) -> float:
         """Return the length of a trigger cycle in revolutions of the tach shaft."""
-        pulses = self.pulses_per_trigger or self.pulses_per_revolution
-        return pulses / self.pulses_per_revolution
+        return self.pulses_in_trigger_cycle / self.pulses_per_revolution
 
     @property
     def trigger_period(self) -> float:
         """Return the length of a trigger cycle in s."""
-        return self.trigger_revolutions / self.trigger_speed
+        return self.revolutions_per_trigger / self.trigger_speed
 
     @property
     def cycle_length(self) -> float:
         """Return r, the length of a trigger cycle in fundamental cycles."""
-        return self.ratio * self.trigger_revolutions
+        return self.ratio * self.revolutions_per_trigger
 
     @property
     def duration(self) -> float:

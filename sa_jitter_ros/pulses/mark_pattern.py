@@ -16,6 +16,9 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
 
+#: Standard deviation of normal variables, over the median of their magnitudes: strays among them
+#: hardly move it.
+OF_MEDIAN = 1.4826
 _FEWEST = 2  # intervals of a mark
 # How much more the means of the marks have to scatter than the intervals of one mark explain.
 _SIGNIFICANT = 4.0
@@ -85,7 +88,7 @@ def mark_pattern(marks: IntArray, levels: FloatArray, count: int, *,
     every = deviations[:, known_marks]
     every = every[np.isfinite(every)]
     # The median of the magnitudes is not moved by strays; of two values it is their deviation.
-    scatter = 1.48 * float(np.median(np.abs(every)))
+    scatter = OF_MEDIAN * float(np.median(np.abs(every)))
     per_mark = every.size / np.count_nonzero(known_marks)
     widths[known_marks] -= widths[known_marks].mean()
     return MarkPattern(_shrunk(widths, known_marks, scatter**2 / per_mark, significant),

@@ -21,6 +21,7 @@ import math
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray, IntArray
+from sa_jitter_ros.pulses.mark_pattern import OF_MEDIAN
 from scipy.ndimage import uniform_filter1d
 
 _FEWEST = 4
@@ -200,7 +201,7 @@ def _over_revolution(values: FloatArray, count: int) -> FloatArray:
 def _clipped(table: FloatArray) -> FloatArray:
     """Return the table (revolution, mark) with NaN in the place of outliers."""
     off = np.abs(table - np.nanmedian(table, axis=0))
-    spread = 1.4826 * float(np.nanmedian(off))
+    spread = OF_MEDIAN * float(np.nanmedian(off))
     return np.where(off <= max(_CLIPPED * spread, 1e-12), table, np.nan)
 
 

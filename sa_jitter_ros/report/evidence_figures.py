@@ -255,7 +255,7 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
 def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
     """Draw the mean error of each mark of the target, or of each of a few pulses."""
     model = evidence.model
-    step = model.pulses_per_trigger or model.pulses_per_revolution
+    step = model.pulses_in_trigger_cycle
     angles = [effect.values['pulse_angles'] for effect in version.effects
               if effect.name == 'target_geometry']
     marks = len(angles[0]) if angles else 1

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
+from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.number_text import order_words, percent_text
 from sa_jitter_ros.report.report import change_text, other_numbers, parameters_text, refinements
 
@@ -22,7 +23,6 @@ Json = Any
 
 _LOSS = 0.05  # of an amplitude, from which on correction is worth its work
 _MEANS = ('observed', 'standard_error', 'predicted_before', 'predicted_after')
-_LARGEST = 0.01  # change of an amplitude that the effects of `undecided` may make, at least
 
 
 def order_shares(content: Mapping[str, Json]) -> Sequence[Mapping[str, Json]]:
@@ -141,7 +141,7 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
     if content['undecided'] and content['lines'] and content['verdict'] != 'unexplained':
         steps.append('This recording cannot exclude '
                      f'{_listed(content["undecided"], "or")}, which may change '
-                     f'an amplitude by {percent_text(_LARGEST)} or more. A longer recording '
+                     f'an amplitude by {percent_text(NOTICEABLE)} or more. A longer recording '
                      'can.')
     if not content['lines']:
         steps += [_sentence(remark.rpartition('; ')[2]) for remark in content['remarks'][-1:]]
