@@ -27,9 +27,13 @@ from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 
-_FEWEST = 2  # pulses of each mark in an average
-_MEMORY = 50.0  # averages
-_DECIDES = 0.5  # share of the errors that are taken, with which the vibration decides
+_FEWEST = 2  # pulses of each mark in an average: of one, all may be its jitter
+# Averages that the mean remembers: fewer leave more of the noise, more follow a target that
+# changes (another speed, a mark that bends) later.
+_MEMORY = 50.0
+# Share of the errors that are taken, with which the vibration decides: from half on, the
+# angles are larger than their standard errors.
+_DECIDES = 0.5
 
 
 class RecoveredMarks:

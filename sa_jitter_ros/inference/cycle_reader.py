@@ -21,7 +21,9 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import margin
 
-#: Samples on either side of a cycle, for interpolation and corrected pulses.
+#: Samples on either side of a cycle, for interpolation, which reads 8, and for corrected pulses
+#: that lie outside the measured ones. With more of them, more cycles beside gaps and ends are
+#: lost.
 MARGIN = 40
 #: How samples are read between samples.
 METHOD = 'band_limited'

@@ -33,7 +33,9 @@ from sa_jitter_ros.prediction.influence import AveragePulses, known_errors, with
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
-_COHERENT = 0.9
+_COHERENT = 0.9  # of that of the best line, which noise and modulation lower, too
+# Of channels, each predicted by the others: with two, half of the channels would have to show the
+# errors; each more is one more recovery of all pulses.
 _GROUPS = 3
 _LAGS = 5  # at which errors on the ticks of a clock depend on each other, where they do
 

@@ -26,7 +26,11 @@ from math import log1p
 from operator import itemgetter, mul
 from typing import NamedTuple
 
-# Logarithms of how unlikely they are.
+# Logarithms of how unlikely they are: of a stray, e^6 or 400 to 1. Lower ones take a late pulse
+# for a stray and a missing one, higher ones a stray for a true pulse of a shaft that jumps. That
+# more are missing costs less, since what hid the first one (a gap, a threshold) hides those beside
+# it. A jump costs more than a stray and a missing pulse together, so that it is rather a displaced
+# pulse.
 STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 1.5, 12.0
 # More, of a speed that falls to a half, a third, ... at once: rather, pulses are missing.
 FRACTION, _WHOLE = 48.0, 0.03
@@ -37,10 +41,13 @@ CERTAIN = 1e6
 #: intervals that predict the next one
 REACH = 8
 _NEAREST = 1e-3  # intervals from its place at which no average shows that a pulse is displaced
+# Below a stray and a missing pulse, so that a tooth beside a gap remains a tooth.
 BELIEVED = 3.0  # the most that a deviation within a given tolerance costs
+# Odds of 55 to 1. A larger margin decides later, a smaller one more often wrongly.
 MARGIN = 4.0  # paths that cost so much more than the best one are out of the question
+# As much as a jump and the margin: the best path may yet need a jump that another one does not.
 _DROPPED = 16.0
-_MOST_PATHS = 48
+_MOST_PATHS = 48  # bounds time and memory where nothing is clear
 _SLOWED = 4  # intervals that show that a shaft slows down
 _STOPS = 0.05  # of the speed, or of its square, that must be left
 

@@ -24,12 +24,17 @@ from sa_jitter_ros.arrays import FloatArray, IntArray
 from sa_jitter_ros.pulses.mark_pattern import OF_MEDIAN
 from scipy.ndimage import uniform_filter1d
 
-_FEWEST = 4
+_FEWEST = 4  # revolutions; without the first and the last, two show how much a mark scatters
 _ROUNDS = 4  # which missing pulses and teeth need
 _CLIPPED = 5.0  # robust standard deviations: displaced pulses tell nothing of their mark
 _BLOCK = 4  # revolutions: beyond them what is left of the speed is independent
-_OF_ALL = 10.0  # blocks for which the scatter of all marks counts
-# Squared standard errors: more than chance makes of all marks together, and of each one.
+# Blocks for which the scatter of all marks counts: of fewer, that of one mark is known to worse
+# than half (sqrt(2 / 10)); more would hide that one mark scatters more than others.
+_OF_ALL = 10.0
+# Squared standard errors: more than chance makes of all marks together, and of each one. The one
+# is five standard errors of a single mark, and still 2.3 standard deviations of the sum over 60
+# marks; of two turns of a pattern, the likelier one is then e^12.5 times as likely. The other is
+# three standard errors of every mark.
 _CLEAR, _OTHER = 25.0, 9.0
 _ALIKE = 0.1  # share of its angles by which a pattern may differ beside standard errors
 
