@@ -72,3 +72,12 @@ def test_nothing_is_said_of_a_steady_shaft(teeth, missing):
     amplitudes, said = averaged(vibration, pulses, orders=[3.0], pulses_per_revolution=teeth,
                                 missing_teeth=missing)
     assert (amplitudes[0], said) == (pytest.approx(1.0, abs=5e-3), [])
+
+
+@pytest.mark.parametrize('teeth', [6, 12])
+def test_jitter_is_no_pattern_of_the_marks(rng, teeth):
+    vibration, pulses = machine(0.0, 1, 0.0, teeth, 0, [3], [0.3])
+    for _ in range(20):
+        _, said = averaged(vibration, pulses + rng.normal(0.0, 3e-4, pulses.size),
+                           orders=[3.0, 100.0], pulses_per_revolution=teeth)
+        assert said == []

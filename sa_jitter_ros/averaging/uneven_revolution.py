@@ -17,6 +17,9 @@ from sa_jitter_ros.averaging.average import AverageSettings
 _FEWEST = 4  # marks that show the motion inside a revolution, and revolutions
 _LOSS = 0.01  # of an amplitude, from which on it is said
 _WHOLE = 0.02  # part of a revolution, by which its neighbours may differ
+# Standard error of a median over that of a mean; power of a pattern over that of its errors, which
+# the jitter of the first mark gives to all others alike.
+_OF_MEDIAN, _CLEAR = 1.25, 9.0
 
 
 def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
@@ -25,8 +28,8 @@ def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
     Say which order a pattern of the pulses (pulse,) that each revolution repeats attenuates most.
 
     Returns '' where trigger cycles are no revolutions or their average keeps 99 % of each order,
-    where marks or revolutions are fewer than four, or where less than half of the revolutions take
-    as long as the others.
+    where marks or revolutions are fewer than four, where less than half of the revolutions take as
+    long as the others, or where the jitter of the pulses leaves such a pattern by chance.
     """
     marks, orders = pulses_per_revolution - missing_teeth, settings.orders
     count = (pulses.size - 1) // max(marks, 1)
@@ -42,6 +45,9 @@ def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
     nominal = np.ones(marks) / pulses_per_revolution
     nominal[np.argmax(pitch)] *= 1.0 + missing_teeth
     off = np.cumsum(pitch - nominal)
+    error = _OF_MEDIAN * np.std(part[steady], axis=0) / np.sqrt(np.count_nonzero(steady))
+    if off @ off < _CLEAR * (error @ error):  # jitter leaves as much
+        return ''
     angle = 2j * np.pi * settings.cycle_length * np.array(orders)[:, None]
     turn, place = angle * off, 2.0 * angle * np.cumsum(nominal)
     # what is missing of an order, and what its negative one adds at the worst phase
