@@ -12,8 +12,9 @@
 The tick of the clock that times the pulses: of a slow one from a few intervals, else from all.
 
 No shaft has equal intervals. If most of a few are equal, or nearly so beside the others, a clock
-rounds them, and all are whole multiples of its tick. At a changing speed intervals still differ by multiples of the tick: by few
-ticks those that are nearly equal, from which it follows step by step over longer and longer times.
+rounds them, and all are whole multiples of its tick. At a changing speed intervals still differ by
+multiples of the tick: by few ticks those that are nearly equal, from which it follows step by step
+over longer and longer times.
 """
 
 import numpy as np
