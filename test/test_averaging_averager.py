@@ -21,6 +21,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.averager_parameters import PARAMETERS, shaft_parameters
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.errors import DataWarning
 from sa_jitter_ros.pulses.resampling import interpolator_gain, METHODS
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
@@ -432,3 +433,11 @@ def test_path_delay_is_taken_from_the_pulses():
     np.testing.assert_allclose(delayed.pulses, pulses, rtol=0, atol=1e-12)
     with pytest.raises(sa.ParameterError, match='path_delay'):
         sa.average(vibration, RATE, pulses, path_delay=np.inf)
+
+
+def test_cycles_that_lack_pulses_from_the_start_are_counted(rng):
+    pulses = np.delete(np.arange(1, 36 * 40) / 720.0, 36 * np.arange(16) + 5)
+    with pytest.warns(DataWarning) as said:
+        sa.average(rng.normal(size=1000), 500.0, pulses, pulses_per_revolution=36)
+    assert str(said[0].message).endswith(
+        '16 missing pulses; no valid pulses to 0.801389 s: 16 trigger cycles discarded')

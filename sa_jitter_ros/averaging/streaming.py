@@ -243,8 +243,9 @@ class StreamingAverager:
         before = np.concatenate(((self._last_time,), triggers.times[:-1]))
         long = (items['skipped'] > _FEW) | (triggers.times - before > _SILENCE)
         for number in np.flatnonzero(triggers.starts_run & long & ~anew):
+            since = '' if np.isnan(before[number]) else f'from {before[number]:.6f} s '
             self._messages.append(
-                f'no valid pulses from {before[number]:.6f} s to {triggers.times[number]:.6f} s: '
+                f'no valid pulses {since}to {triggers.times[number]:.6f} s: '
                 f'{items["skipped"][number] or "an unknown number of"} trigger cycles discarded')
 
     def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
