@@ -19,7 +19,7 @@ _LOSS = 0.01  # of an amplitude, from which on it is said
 _WHOLE = 0.02  # part of a revolution, by which its neighbours may differ
 # Standard error of a median over that of a mean; power of a pattern over that of its errors, which
 # the jitter of the first mark gives to all others alike.
-_OF_MEDIAN, _CLEAR = 1.25, 9.0
+_MEDIAN_ERROR, _CLEAR = 1.25, 9.0
 
 
 def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
@@ -45,7 +45,7 @@ def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
     nominal = np.ones(marks) / pulses_per_revolution
     nominal[np.argmax(pitch)] *= 1.0 + missing_teeth
     off = np.cumsum(pitch - nominal)
-    error = _OF_MEDIAN * np.std(part[steady], axis=0) / np.sqrt(np.count_nonzero(steady))
+    error = _MEDIAN_ERROR * np.std(part[steady], axis=0) / np.sqrt(np.count_nonzero(steady))
     if off @ off < _CLEAR * (error @ error):  # jitter leaves as much
         return ''
     angle = 2j * np.pi * settings.cycle_length * np.array(orders)[:, None]
