@@ -100,18 +100,6 @@ def test_clock_of_a_few_ticks_from_mark_to_mark_costs_no_pulse(ticks):
     assert (counts.accepted, counts.cycles_discarded) == (marks.size, 0)
 
 
-@pytest.mark.parametrize('noise', [1e-9, 1e-3, 0.02])
-@pytest.mark.parametrize(('ticks', 'marks'), [(18.0, 60), (13.3, 36), (20.0, 6), (40.0, 1)])
-def test_noise_on_the_ticks_of_a_clock_costs_few_pulses(rng, ticks, marks, noise):
-    """Edges that are interpolated between samples differ from these by the noise of the tach."""
-    angle = np.arange(1.0, 4000.0)
-    true = angle - 4000.0 * 0.01 * (angle / 4000.0) ** 2  # one per cent faster at the end
-    pulses = np.ceil(ticks * true) / ticks + rng.normal(0.0, noise / ticks, true.size)
-    *_, counts = validate(pulses / (20.0 * marks), pulses_per_revolution=marks)
-    assert counts.accepted >= 0.99 * true.size
-    assert counts.cycles_discarded <= 0.02 * true.size / marks + 2
-
-
 def test_missing_pulses_break_or_are_bridged():
     gappy = np.delete(STEADY, [7, 20, 21])
     _, runs, _, counts = validate(gappy)

@@ -11,10 +11,9 @@
 """
 The tick of the clock that times the pulses: of a slow one from a few intervals, else from all.
 
-No shaft has equal intervals. If most of a few are equal, or nearly so beside the others, a clock
-rounds them, and all are whole multiples of its tick. At a changing speed intervals still differ by
-multiples of the tick: by few ticks those that are nearly equal, from which it follows step by step
-over longer and longer times.
+No shaft has equal intervals. If most of a few are equal, a clock rounds them, and all are whole
+multiples of its tick. At a changing speed intervals still differ by multiples of the tick: by few
+ticks those that are nearly equal, from which it follows step by step over longer and longer times.
 """
 
 import numpy as np
@@ -24,9 +23,6 @@ _FEWEST = 6  # intervals
 _DIFFERENT = 0.5  # most of the intervals that differ from all others
 _LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick
 _WHOLE = 0.02  # ticks by which an interval may differ from a whole number of them
-# Gaps between intervals of unequally many ticks, over those that noise makes. Noise may leave an
-# interval uncertain by more than _VAGUE ticks if it has at most _COARSE of them.
-_CLEAR, _VAGUE, _COARSE = 4.0, 0.25, 100.0
 _PARTS = 3  # of the smallest difference seen, that a tick may be
 _STAMP = 2.5e-9  # s, rounding of time stamps
 # Of a whole recording: smallest differences of intervals from which the tick follows, the most
@@ -34,52 +30,34 @@ _STAMP = 2.5e-9  # s, rounding of time stamps
 _SMALL_GAPS, _MOST_TICKS, _LEAST_TICKS, _EXACT = 12, 40, 4.0, 0.02
 
 
-def clock_tick(intervals: FloatArray, latest: float, *, noisy: bool = False) -> float:
+def clock_tick(intervals: FloatArray, latest: float) -> float:
     """
     Return the tick (s) whose multiples all intervals (n,) are, 0.0 without such a tick.
 
-    `latest` is the latest time (s) from which they were computed: it tells their rounding. If
-    `noisy`, they may differ from these by noise that is small beside the tick.
+    `latest` is the latest time (s) from which they were computed: it tells their rounding.
 
     >>> clock_tick(np.array([0.25, 0.25, 0.26, 0.25, 0.25, 0.24, 0.26]), 10.0).__round__(9)
     0.01
     >>> clock_tick(np.array([0.25, 0.25, 0.253, 0.25, 0.25, 0.24, 0.251]), 10.0)
     0.0
     """
-    values = np.sort(intervals)
-    if values.size < _FEWEST:
-        return 0.0
-    gaps = np.diff(values)
     rounding = _STAMP + 4.0 * float(np.spacing(abs(latest)))
-    if noisy:
-        rounding = _noise(gaps, rounding)
-    groups = np.split(values, np.flatnonzero(gaps > rounding) + 1)
-    if not 1 < len(groups) <= _DIFFERENT * values.size:
+    values = np.sort(intervals)
+    differ = np.diff(values) > rounding
+    if values.size < _FEWEST or np.count_nonzero(differ) + 1 > _DIFFERENT * values.size:
         return 0.0
-    means = np.array([item.mean() for item in groups])
-    smallest = float(np.diff(means).min())
-    if smallest > _LONGEST_TICK * float(np.median(intervals)):
+    values = values[np.append(differ, True)]
+    smallest = float(np.diff(values).min(initial=np.inf))
+    if not smallest <= _LONGEST_TICK * float(np.median(intervals)):
         return 0.0
     for part in range(1, _PARTS + 1):
-        ticks = np.rint((means - means[0]) * part / smallest)
-        tick = float((means - means[0]) @ ticks / (ticks @ ticks))
-        slack = _WHOLE + means / tick * rounding / (means[-1] - means[0])
-        fine = slack.max() > _VAGUE and means[-1] > _COARSE * tick  # a tick of noise
-        if not fine and np.all(np.abs(means / tick - np.rint(means / tick)) <= slack):
+        tick = smallest / part
+        ticks = np.rint((values - values[0]) / tick)
+        tick = float((values - values[0]) @ ticks / (ticks @ ticks))
+        slack = _WHOLE + values / tick * rounding / (values[-1] - values[0])
+        if np.all(np.abs(values / tick - np.rint(values / tick)) <= slack):
             return tick
     return 0.0
-
-
-def _noise(gaps: FloatArray, least: float) -> float:
-    """
-    Return the largest of the gaps (n,) between sorted intervals of equally many ticks.
-
-    Those beside them, between intervals of unequally many ticks, are much longer; `least` is
-    returned where none are.
-    """
-    rising = np.sort(np.maximum(gaps, least))[int((1.0 - _DIFFERENT) * gaps.size):]
-    longer = rising[1:] / rising[:-1]
-    return float(rising[np.argmax(longer)]) if longer.max(initial=0.0) > _CLEAR else least
 
 
 def find_grid(times: FloatArray, rounding: float, least: float = 0.0

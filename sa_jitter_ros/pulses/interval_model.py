@@ -60,8 +60,8 @@ _FLOOR, _HARMLESS, _SAME = 1e-3, 1e-3, 3e-3
 # interval beside a shorter one shows. These two may differ by _OPPOSITE of their deviation.
 _LONE_STEP, _LONE_PAIR, _OPPOSITE = 0.015, 0.006, 0.2
 # A longer step is a tick if it comes again, so many intervals later, with the same size: no
-# displaced pulse does that. By how much of it the two sizes may differ, and with noise.
-_APART, _AS_LARGE, _NEARLY = 3.0, 1e-3, 0.1
+# displaced pulse does that. By how much of it the two sizes may differ.
+_APART, _AS_LARGE = 3.0, 1e-3
 
 
 class IntervalModel:
@@ -187,20 +187,17 @@ class IntervalModel:
         They are from mark to mark, of relative `widths` (n,), and end at the time `latest` (s).
         """
         length = math.exp(self.expected)
-        every = np.array([*self._intervals, *intervals])
-        exact = clock_tick(every, latest) / length
-        tick = exact or clock_tick(every, latest, noisy=True) / length
+        tick = clock_tick(np.array([*self._intervals, *intervals]), latest) / length
         if tick <= self.tick:
             return False
         # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
-        lone = not exact or not clock_tick(np.array(self._intervals), latest)
+        lone = not clock_tick(np.array(self._intervals), latest)
         off = intervals / length - widths  # a displaced pulse: one is longer, the other shorter
         opposite = abs(off.sum()) < _OPPOSITE * np.abs(off).max()
-        largest = (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle if exact else 0.0
-        if lone and tick > largest:
+        if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
             (seen, size), self._lone = self._lone, (latest, tick * length)
             if opposite or latest - seen <= _APART * length or (
-                    abs(tick * length - size) >= (_AS_LARGE if exact else _NEARLY) * size):
+                    abs(tick * length - size) >= _AS_LARGE * tick * length):
                 return False
         before, self.tick, self._latest = self.tolerance, tick, latest
         self._set_tolerance()
