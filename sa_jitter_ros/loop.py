@@ -40,7 +40,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import (
-    channel_faults, copied_channels, is_copy, is_lost, without_channels)
+    channel_faults, is_copy, is_lost, without_channels)
 from sa_jitter_ros.report.report import parameters_text, report, summary
 from sa_jitter_ros.whole_files import finished_together
 
@@ -246,10 +246,9 @@ def _usable(recordings: Sequence[Recording], names: Sequence[str]
     lost: set[int] = set()
     faults = []
     for name, recording in zip(names, recordings):
-        found = channel_faults(recording, most_lost=0.0)
+        found = channel_faults(recording, most_lost=0.0, copies=True)
         if sum(map(is_lost, found.values())) == recording.channels:  # then gaps cost cycles
-            found = channel_faults(recording)
-        found = copied_channels(recording) | found
+            found = channel_faults(recording, copies=True)
         for channel, reason in found.items():
             lost |= {channel} if is_lost(reason) else set()
             faults.append(f'{name}: {recording.channel_names[channel]} {reason}'

@@ -92,31 +92,26 @@ def stuck(values: FloatArray) -> BoolArray:
     return found if np.mean(found) < _MOST_LOST else np.zeros(values.size, np.bool_)
 
 
-def channel_faults(recording: Recording, *, most_lost: float = _MOST_LOST) -> dict[int, str]:
+def channel_faults(recording: Recording, *, most_lost: float = _MOST_LOST, copies: bool = False
+                   ) -> dict[int, str]:
     """
     Return the bad channels of a recording with the reason, from its first samples.
 
-    `most_lost` is that of `bad_channels`.
-    """
-    return bad_channels(_first_samples(recording), most_lost=most_lost)
-
-
-def copied_channels(recording: Recording) -> dict[int, str]:
-    """
-    Return the channels that repeat an earlier one sample by sample, with the reason.
+    `most_lost` is that of `bad_channels`. With `copies` those that repeat an earlier one sample by
+    sample are bad, too.
 
     >>> from sa_jitter_ros.recordings.recording import ArraySource
     >>> row = np.sin(np.arange(99.0))
-    >>> copied_channels(Recording(ArraySource(np.array([row, 2.0 * row, row])), 1e3))
+    >>> channel_faults(Recording(ArraySource(np.array([row, 2.0 * row, row])), 1e3), copies=True)
     {2: 'holds the samples of channel 0 again'}
     """
     samples, found = _first_samples(recording), {}
-    for channel in range(1, len(samples)):
+    for channel in range(1, len(samples) if copies else 0):
         for other in range(channel):
             if channel not in found and np.array_equal(
                     samples[channel], samples[other], equal_nan=True):
                 found[channel] = f'holds the samples of {recording.channel_names[other]} again'
-    return found
+    return found | bad_channels(samples, most_lost=most_lost)
 
 
 def is_copy(one: Recording, other: Recording) -> bool:
