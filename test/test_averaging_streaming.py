@@ -452,9 +452,9 @@ def test_standard_error_of_the_waveform_is_its_scatter(rng):
 # --- kinds of average ----------------------------------------------------------------------------
 
 
-def single_cycles(samples, pulses, rate, cycles):
+def single_cycles(samples, pulses, rate, cycles, order):
     """Return the amplitude of every trigger cycle, one average each."""
-    target = averager(shaft={'cycle_length': cycles, 'orders': (3.0,), 'trigger_cycles': 1})
+    target = averager(shaft={'cycle_length': cycles, 'orders': (order,), 'trigger_cycles': 1})
     target.add_pulses(pulses)
     return np.array([item.amplitudes for _, item in target.add_samples(
         SampleBlock(samples, 0.0, rate, 0))])
@@ -463,10 +463,11 @@ def single_cycles(samples, pulses, rate, cycles):
 @pytest.mark.parametrize('cycles', [1.0, 2.40789])
 def test_kinds_of_average_weigh_the_cycles_as_they_say(cycles, rng):
     samples, pulses = rng.standard_normal((2, 4000)), np.arange(0.01, 3.9, 0.1)
-    single = single_cycles(samples, pulses, 1000.0, cycles)
+    order = 7.0 / cycles  # whole in a trigger cycle, or each average has another mean of samples
+    single = single_cycles(samples, pulses, 1000.0, cycles, order)
     found = {}
     for averaging in AVERAGING:
-        target = averager(shaft={'cycle_length': cycles, 'orders': (3.0,), 'trigger_cycles': 6,
+        target = averager(shaft={'cycle_length': cycles, 'orders': (order,), 'trigger_cycles': 6,
                                  'averaging': averaging})
         target.add_pulses(pulses)
         found[averaging] = [item for _, item in target.add_samples(
@@ -492,6 +493,27 @@ def test_kinds_of_average_weigh_the_cycles_as_they_say(cycles, rng):
             for key in FIELDS[3:]:
                 np.testing.assert_allclose(getattr(sliding, key), getattr(block, key),
                                            rtol=1e-9, atol=1e-12, err_msg=key)
+
+
+@pytest.mark.parametrize(('ratio', 'trigger_cycles', 'averaging'), [
+    (2.4, 1, 'block'), (2.40789, 7, 'exponential'), (53.0 / 37.0, 5, 'sliding'),
+    (0.41, 12, 'block'), (3.0, 4, 'block')])
+def test_a_constant_in_the_samples_changes_no_amplitude(ratio, trigger_cycles, averaging, rng):
+    time, pulses = np.arange(2000) / 1000.0, np.arange(0.01, 1.9, 0.1)
+    pulses = pulses + rng.uniform(0.0, 1e-3, pulses.size)
+    samples = np.cos(2.0 * np.pi * 30.0 * ratio * time) + 0.1 * rng.standard_normal((2, time.size))
+    found, law = [], str(rng.choice(['linear', 'spline']))
+    for constant in (0.0, 9.81):
+        target = averager(shaft={'cycle_length': ratio, 'orders': (3.0, 4.5), 'angle_law': law,
+                                 'averaging': averaging, 'trigger_cycles': trigger_cycles})
+        target.add_pulses(pulses)
+        found.append([item for _, item in target.add_samples(
+            SampleBlock(samples + constant, 0.0, 1000.0, 0))])
+    for one, other in zip(*found, strict=True):
+        for name in ('amplitudes', 'cycle_amplitudes', 'noise'):
+            # The interpolator and the integral around the pulses leave 1e-6 of the constant.
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=2e-5)
+        np.testing.assert_allclose(one.waveform + constant, other.waveform, atol=2e-5)
 
 
 # --- gaps, restarts ------------------------------------------------------------------------------

@@ -376,6 +376,21 @@ def _turned(whole: IntArray, rest: FloatArray, orders: tuple[float, ...]) -> Com
                                  + np.multiply.outer(rest, orders)))
 
 
+def amplitudes_of_one(cycles: float, orders: tuple[float, ...], first_cycle: int, count: int,
+                      points: int = 0) -> ComplexArray:
+    """
+    Return the amplitudes (cycle, order) that a signal of 1 has in `count` cycles; of order 0, 2.
+
+    They are those of the trapezoidal rule with so many `points`, or with 0 points of the integral.
+    """
+    angle = 2.0 * np.pi * cycles * np.array(orders)
+    half = np.where(angle, angle, np.nan) / 2.0
+    length = 1.0 / half if not points else 1.0 / (points * np.tan(half / points))
+    in_one = np.where(angle, 1j * (np.exp(-1j * angle) - 1.0) * length, 2.0)
+    whole, rest = multiples(exact_cycles(cycles), first_cycle, count)
+    return np.asarray(in_one * _turned(whole[:-1], rest[:-1], orders))
+
+
 @dataclass(frozen=True)
 class WaveformPoints:
     """

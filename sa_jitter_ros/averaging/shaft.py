@@ -28,8 +28,8 @@ from sa_jitter_ros.arrays import ComplexArray, FloatArray
 from sa_jitter_ros.averaging.amplitude_errors import Repeatability, waveform_error
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
-    choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
-    has_same_angles, joined_cycles, waveform_cutoff, WaveformPoints)
+    amplitudes_of_one, choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE,
+    exact_cycles, grid_points, has_same_angles, joined_cycles, waveform_cutoff, WaveformPoints)
 from sa_jitter_ros.averaging.interpolator_gain import mean_gain, refused_orders
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
@@ -48,6 +48,8 @@ TOGETHER = 1 << 20
 _CACHED, _FEW = 1 << 17, 1 << 11
 # Points of a trigger cycle beside which those around its ends cost little.
 _LONG = 8 * EDGE
+# Cycles that an order may be off a whole number of them: the mean leaks by as much of itself.
+_WHOLE = 1e-9
 # Pulses (s) of a trigger cycle, and its number since the angle was 0.
 _PLACE = np.dtype([('begin', np.float64), ('end', np.float64), ('number', np.int64)])
 
@@ -175,7 +177,8 @@ class ShaftAverager:
         """
         self._take(cycles)
         self._average_waiting()
-        return np.asarray(self._amplitudes.items * self._gains.items[:, None])
+        return np.asarray(self._without_constant(self._amplitudes.items)
+                          * self._gains.items[:, None])
 
     def _take(self, cycles: CycleSamples) -> None:
         """Let cycles wait; raise `SignalError`."""
@@ -224,7 +227,8 @@ class ShaftAverager:
         self._rate = cycles.rate
         gains = gain_below_nyquist(self.settings.interpolation, np.multiply.outer(
             self.settings.cycle_length / cycles.periods, self.settings.orders) / self._rate)
-        amplitudes = self._resample(cycles) * (1.0 / gains)[:, None]
+        amplitudes = self._resample(cycles)
+        amplitudes[..., :len(self.settings.orders)] *= (1.0 / gains)[:, None]
         # Real and imaginary parts have means of their own.
         self._amplitude_mean.update(np.ascontiguousarray(amplitudes).view(np.float64))
         places = np.empty(count, _PLACE)
@@ -295,6 +299,12 @@ class ShaftAverager:
         self._noise: tuple[FloatArray, Repeatability] | None = None
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_wave_mean()
+        # The mean of the samples leaks into orders without whole cycles in a trigger cycle. Order
+        # 0 and, as one more channel, a signal of 1 tell how much, where an average has a cycle.
+        cycles = settings.cycle_length * np.array(settings.orders)
+        self._leaking = (abs(cycles - np.rint(cycles)) > _WHOLE) & (
+            cycles * settings.trigger_cycles >= 1.0)
+        self._orders = (*settings.orders, 0.0) if self._leaking.any() else settings.orders
         # Of the latest N_t cycles: amplitudes, and what the interpolator left of them before.
         self._amplitudes = Rows(np.empty(0))
         self._gains = Rows(np.empty((0, len(settings.orders))))
@@ -330,7 +340,7 @@ class ShaftAverager:
                  ) -> ComplexArray:
         """Return the amplitudes from a grid of so many points, which is written to `every`."""
         count, channels = cycles.count, cycles.samples.shape[1]
-        projection = CycleProjection(size, self.settings.cycle_length, self.settings.orders)
+        projection = CycleProjection(size, self.settings.cycle_length, self._orders)
         piece, u = size, np.arange(size) / size
         if self._law is LINEAR_LAW:  # others fit a cycle at once
             piece = max(max(_CACHED // channels, _FEW) // (count * projection.step), 1)
@@ -342,7 +352,8 @@ class ShaftAverager:
             projection.add(begin, values)
             if every is not None:
                 every[:, where] = values
-        return projection.amplitudes(cycles.end(method=self.settings.interpolation), self._cycle)
+        return self._with_one(projection.amplitudes(
+            cycles.end(method=self.settings.interpolation), self._cycle), size)
 
     def _resample_even(self, cycles: CycleSamples, points: WaveformPoints) -> ComplexArray:
         """As `_resample`, with the points of the waveform at the same angles of every cycle."""
@@ -363,12 +374,34 @@ class ShaftAverager:
             values = cycles.part(first, end).at(
                 self._law, part.fractions(EDGE), ahead=part.ahead,
                 method=self.settings.interpolation).reshape(end - first, -1, channels)
-            sums.append(part.sums(values, self.settings.orders))
+            sums.append(part.sums(values, self._orders))
             for k, wave in enumerate(values[:, EDGE:], first):
                 every[begin[k]:begin[k + 1]] = wave[:begin[k + 1] - begin[k]]
         self._add_points(points, every)
         total, begins, ends = (np.concatenate(parts) for parts in zip(*sums))
-        return points.amplitudes(total, begins, ends, self.settings.orders)
+        return self._with_one(points.amplitudes(total, begins, ends, self._orders), 0)
+
+    def _with_one(self, amplitudes: ComplexArray, points: int) -> ComplexArray:
+        """Return amplitudes with those of a signal of 1 as another channel, where it is needed."""
+        if len(self._orders) == len(self.settings.orders):
+            return amplitudes
+        one = amplitudes_of_one(self.settings.cycle_length, self._orders, self._cycle,
+                                len(amplitudes), points)
+        one[:, :-1] *= self._leaking
+        return np.concatenate((amplitudes, one[:, None]), axis=1)
+
+    def _without_constant(self, amplitudes: ComplexArray) -> ComplexArray:
+        """
+        Return amplitudes (..., channel, order) without what the mean of the samples adds.
+
+        The mean is weighted by a Hann window, so that orders with other than whole cycles in the
+        average do not leak into it.
+        """
+        if len(self._orders) == len(self.settings.orders):
+            return amplitudes
+        means = self._amplitudes.items[:, :-1, -1].real / 2.0
+        mean = np.average(means, axis=0, weights=np.hanning(len(means) + 2)[1:-1])
+        return np.asarray(amplitudes[..., :-1, :-1] - mean[:, None] * amplitudes[..., -1:, :-1])
 
     def _new_mean(self, cycles: float) -> RunningMean:
         if self.settings.averaging == 'exponential':
@@ -451,13 +484,14 @@ class ShaftAverager:
             window = math.floor(self._angle(settings.trigger_cycles))
             count = min(count, max(window, 1))
         pulses, used, seconds = self._edges()
-        cycles, gains = self._amplitudes.items, self._gains.items
+        cycles, gains = self._without_constant(self._amplitudes.items), self._gains.items
         cycles.flags.writeable = False
         numbers, speed = self._places.items['number'], len(cycles) / seconds
         refused = refused_orders(settings.orders, gains, method=settings.interpolation,
                                  rate=self._rate, speed=settings.cycle_length * speed)
         gain = mean_gain(gains, settings.orders, refused)
-        amplitudes: ComplexArray = self._amplitude_mean.mean.view(np.complex128)
+        amplitudes = self._without_constant(
+            self._amplitude_mean.mean.view(np.complex128))
         if refused:
             cycles, amplitudes = (np.where(np.isnan(gain), np.nan, item)
                                   for item in (cycles, amplitudes))
@@ -492,7 +526,7 @@ class ShaftAverager:
         """Return noise and repeatability; a sliding window renews them after an eighth of it."""
         if self._noise is None or self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
-            cycles = self._amplitudes.items * self._gains.items[:, None]
+            cycles = self._without_constant(self._amplitudes.items) * self._gains.items[:, None]
             clean = without_leakage(cycles, orders, cycle_length,
                                     cycle_length * self._places.items['number'])
             self._noise = radial_noise(clean), Repeatability.of(
