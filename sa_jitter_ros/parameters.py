@@ -17,6 +17,7 @@ A `Parameter` converts and checks values; `nodes/parameters.py` declares it to R
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import partial
 import math
 from numbers import Integral, Real
@@ -213,6 +214,17 @@ def unknown_names(values: Mapping[str, Any], known: Mapping[str, Parameter]) -> 
     """Return the names that are neither those of `known` parameters nor of any node."""
     return tuple(sorted(name for name in values if name not in (*known, *_OF_NODE)
                         and not name.startswith('qos_overrides.')))
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """
+    Return a question for the names that an unknown one may stand for, '' if none is like it.
+
+    >>> did_you_mean('trigger_cycle', ['trigger_cycles', 'ratio'])
+    ', did you mean trigger_cycles?'
+    """
+    near = ' or '.join(get_close_matches(name, known, 2, cutoff=0.7))
+    return f', did you mean {near}?' if near else ''
 
 
 def sample_parameters(topic: str) -> tuple[Parameter, ...]:

@@ -395,7 +395,7 @@ def test_defaults_are_those_of_the_node():
 
 
 def test_an_unknown_keyword_is_named_with_the_one_it_looks_like():
-    with pytest.raises(TypeError, match=r"'trigger_cycle': did you mean trigger_cycles"):
+    with pytest.raises(TypeError, match=r"'trigger_cycle', did you mean trigger_cycles"):
         sa.Averager(RATE, trigger_cycle=4)
     with pytest.raises(TypeError, match="unknown keyword 'buffer_seconds'"):
         sa.average(VIBRATION, RATE, PULSES, buffer_seconds=4.0)

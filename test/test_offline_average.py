@@ -257,6 +257,7 @@ def test_figures_of_a_run_up_with_gear(tmp_path):
 @pytest.mark.parametrize(('arguments', 'says'), [
     (['nothing.npz'], 'nothing.npz: No such file or directory: check the path'),
     (['rig.npz', '-p', 'pinoin.ratio:=2'], 'synchronous_averager has no parameter pinoin.ratio'),
+    (['rig.npz', '-p', 'trigger_cycle:=2'], 'trigger_cycle, did you mean trigger_cycles?'),
     (['rig.npz', '-p', 'trigger_cycles=2'], "parameter 'trigger_cycles=2': give NAME:=VALUE"),
     (['rig.npz', '-p', 'trigger_cycles:=-2'], 'trigger_cycles is -2: give at least 1'),
     (['rig.npz', '-p', 'trigger_cycles:=400'], 'make 82 whole trigger cycles of the 400'),

@@ -17,7 +17,6 @@ documentation show them with their defaults by `with_keywords`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from difflib import get_close_matches
 from inspect import Parameter, signature
 import math
 from typing import Any, Literal, TypedDict, TypeVar
@@ -25,7 +24,7 @@ from typing import Any, Literal, TypedDict, TypeVar
 from sa_jitter_ros.averaging.average import AverageSettings, KeyphasorParameters
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine
-from sa_jitter_ros.parameters import number, RATIO, SAME_RATIO
+from sa_jitter_ros.parameters import did_you_mean, number, RATIO, SAME_RATIO
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
 
 Averaging = Literal['block', 'sliding', 'exponential']
@@ -103,9 +102,7 @@ def completed(given: Mapping[str, Any], options: type) -> dict[str, Any]:
     known = list(options.__annotations__)
     for name in given:
         if name not in known:
-            near = ' or '.join(get_close_matches(name, known, 2))
-            raise TypeError(f'unknown keyword {name!r}'
-                            + (f': did you mean {near}?' if near else ''))
+            raise TypeError(f'unknown keyword {name!r}{did_you_mean(name, known)}')
     found = {name: given.get(name, _DEFAULTS[name]) for name in known}
     machine, shaft = found.pop('machine'), found.pop('shaft')
     return found if machine is None else found | {

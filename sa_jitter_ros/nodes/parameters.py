@@ -23,7 +23,6 @@ nodes has a name too, which would rename all of them.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from difflib import get_close_matches
 from itertools import pairwise
 import math
 from pathlib import Path
@@ -37,7 +36,7 @@ import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.machine import following, Machine, PREFIX
 from sa_jitter_ros.parameter_file import named_parameters, value_of
-from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.parameters import did_you_mean, Parameter, Values
 from sa_jitter_ros.recordings.channel_units import channel_parameters, Channels, channels_of
 
 _RULE = re.compile(r'(?:(.*):)?__(?:node|name):=(.*)')  # that renames a node, or all
@@ -206,10 +205,9 @@ class ParameterSet:
         self._node.add_post_set_parameters_callback(self._changed)
         for name in sorted(set(self._node._parameter_overrides) - set(self._specifications)):
             if not name.startswith(_OF_OTHERS):
-                near = ' or '.join(get_close_matches(name, self._specifications, 2, cutoff=0.8))
                 self._node.get_logger().warning(
                     f'parameter {name} is ignored: this node has no parameter of that name'
-                    + (f', did you mean {near}?' if near else ''))
+                    + did_you_mean(name, self._specifications))
 
     def _convert(self, parameters: list[rclpy.parameter.Parameter]
                  ) -> list[rclpy.parameter.Parameter]:

@@ -25,7 +25,7 @@ from sa_jitter_ros.machine import following, Machine, PREFIX
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
-    converted, HARDWARE_ID, Parameter, require_shaft_names, unknown_names, Values)
+    converted, did_you_mean, HARDWARE_ID, Parameter, require_shaft_names, unknown_names, Values)
 from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
@@ -86,8 +86,9 @@ class MachineFile:
         values = {name: value for name, value in found.items() if name in known} | values
         wrong = sorted(overrides.keys() - known.keys() - parts.keys())
         if wrong:
-            raise ParameterError(f'{AVERAGER} has no parameter {", ".join(wrong)}: give some of '
-                                 f'{", ".join(sorted(known))}')
+            near = did_you_mean(wrong[0], known)
+            raise ParameterError(f'{AVERAGER} has no parameter {", ".join(wrong)}'
+                                 + (near or f': give some of {", ".join(sorted(known))}'))
         if params is not None and not known.keys() & (values.keys() - overrides.keys()):
             raise ParameterError(f'{params}: no parameter of {AVERAGER}: give a file with its '
                                  f'section, "/**/{AVERAGER}:" and "ros__parameters:"')
