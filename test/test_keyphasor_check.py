@@ -200,6 +200,18 @@ def test_stated_marks_count_unless_pulses_contradict(rng):
     assert 'marks_contradict' in codes(check)
 
 
+def test_stated_orders_tell_the_marks_and_without_one_there_is_no_ratio(rng):
+    """Lines of a shaft at 1.7992 are multiples of a fifth of the tach shaft's speed by chance."""
+    times = tach(rng)[0]
+    samples = vibration(rng, ratio=1.7992, orders=((1.0, 0.5), (25.0, 1.0), (50.0, 0.6)))
+    check = checked(samples, times, ratio=1.7992, orders=(25.0, 50.0))
+    assert values(check, 'pulses_per_revolution', 'orders') == (1, [1.0, 25.0, 50.0])
+    samples = vibration(rng, ratio=2.2042, orders=((1.0, 0.5), (22.0, 1.0), (44.0, 0.6)))
+    check = checked(samples, times)
+    assert values(check, 'ratio', 'orders') == (None, None)
+    assert 'give the numbers of teeth' in check.findings['ratio'].decided_by
+
+
 @pytest.mark.parametrize('teeth', [(), (19, 183, 76)])
 def test_ratio_of_a_shaft_without_keyphasor(rng, teeth):
     check = checked(vibration(rng, ratio=183 / 76), tach(rng)[0], teeth=teeth)

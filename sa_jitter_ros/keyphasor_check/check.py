@@ -27,7 +27,7 @@ from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.keyphasor_check.clock import find_clock, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
-from sa_jitter_ros.keyphasor_check.declared_parts import contradictions, meshes_seen
+from sa_jitter_ros.keyphasor_check.declared_parts import contradictions, stated_seen
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
@@ -248,7 +248,8 @@ class _Check:
         elif declared == best and declared > 1:
             by = 'stated by the recording, which pulses and vibration do not contradict'
         elif vibration[best] > 2.0:
-            by = 'lines of the vibration are multiples of the shaft speed, or at known meshes'
+            by = ('lines of the vibration are multiples of the shaft speed, known meshes, or '
+                  'stated orders')
         else:
             by = ('even marks look all alike: count the marks on the shaft, or measure its speed '
                   'once with a strobe')
@@ -277,8 +278,9 @@ class _Check:
                          *range(1, _MOST_MARKS + 1)})
         counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
         vibration = marks_evidence(lines, counts)
-        seen = {count: 0 if lines is None else meshes_seen(
-            lines.scaled(float(count)), self._machine) for count in counts}
+        stated = self._recording.ratio * np.array(self._recording.orders)
+        seen = {count: 0 if lines is None else stated_seen(
+            lines.scaled(float(count)), self._machine, stated) for count in counts}
         for count in counts:
             vibration[count] += _DECLARED * seen[count] / max(1, *seen.values())
         log = {}
@@ -424,6 +426,10 @@ class _Check:
             self._warn(
                 'no_orders', f'no order of a shaft at ratio {best:.6g} stands above the noise: '
                 'check ratio, pulses_per_revolution and sample_rate')
+            if stated == 1.0:
+                reason = ('no line of the vibration is a whole order of the tach shaft; give the '
+                          'numbers of teeth (--teeth) or the ratio of another shaft')
+                return Checked(None, None, '1', (), reason), Checked(None, None, '1', (), reason)
         if probability < _SURE and best != 1.0:
             text = ', '.join(f'{value:.6g} ({chance:.0%})'
                              for value, chance in ((best, probability), *others[:4]))
