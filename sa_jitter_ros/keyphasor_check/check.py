@@ -27,7 +27,7 @@ from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.keyphasor_check.clock import find_clock, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
-from sa_jitter_ros.keyphasor_check.declared_parts import contradictions, stated_seen
+from sa_jitter_ros.keyphasor_check.declared_parts import contradictions, meshes_seen, orders_seen
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
@@ -278,11 +278,13 @@ class _Check:
                          *range(1, _MOST_MARKS + 1)})
         counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
         vibration = marks_evidence(lines, counts)
-        stated = self._recording.ratio * np.array(self._recording.orders)
-        seen = {count: 0 if lines is None else stated_seen(
-            lines.scaled(float(count)), self._machine, stated) for count in counts}
+        seen = {count: 0 if lines is None else meshes_seen(
+            lines.scaled(float(count)), self._machine) for count in counts}
         for count in counts:
             vibration[count] += _DECLARED * seen[count] / max(1, *seen.values())
+        if lines is not None and self._recording.orders:
+            vibration[declared] += _DECLARED * orders_seen(
+                lines.scaled(float(declared)), self._recording.ratio, self._recording.orders)
         log = {}
         for count in counts:
             pattern = max((item.evidence - (0.0 if count == item.teeth else _SYMMETRY + math.log(

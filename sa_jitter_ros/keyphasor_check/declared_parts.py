@@ -10,7 +10,7 @@
 
 """Whether the lines of the vibration are those of the declared gears, or of other teeth."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -53,7 +53,7 @@ def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
                      + ': count the teeth')
     if found:
         return [Warn('machine_contradicted', found)]
-    if not stated_seen(lines, machine):
+    if not meshes_seen(lines, machine):
         listed = ', '.join(f'{name} {place:.5g}' for name, place in machine.meshes().items()
                            if name.endswith(' 1x'))
         return [Warn('mesh_absent', f'no line of the vibration is at a mesh of the machine ('
@@ -62,9 +62,15 @@ def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
     return []
 
 
-def stated_seen(lines: ToothLines, machine: Machine, places: Iterable[float] = ()) -> int:
-    """Return how many lines, in orders of the tach shaft, are at a mesh or one of the `places`."""
-    return int(np.count_nonzero(_near(lines, np.array([*machine.meshes().values(), *places]))))
+def meshes_seen(lines: ToothLines, machine: Machine) -> int:
+    """Return how many lines, in orders of the tach shaft, are at a mesh of the machine."""
+    return int(np.count_nonzero(_near(lines, np.array([*machine.meshes().values()]))))
+
+
+def orders_seen(lines: ToothLines, ratio: float, orders: Sequence[float]) -> float:
+    """Return the share of stated orders of a shaft at `ratio` at which there is a line."""
+    seen = _near(lines, ratio * np.array(orders))
+    return min(1.0, float(np.count_nonzero(seen)) / len(orders))
 
 
 def _variants(machine: Machine) -> Iterator[tuple[str, int, int, Machine]]:
