@@ -212,6 +212,13 @@ def test_stated_orders_tell_the_marks_and_without_one_there_is_no_ratio(rng):
     assert 'give the numbers of teeth' in check.findings['ratio'].decided_by
 
 
+def test_a_run_up_with_one_mark_has_the_orders_of_the_gear_and_no_others(rng):
+    orders = ((1.0, 0.5), (13.0, 1.0), (26.0, 0.5))
+    samples = vibration(rng, drift=1.0, orders=orders, noise=0.05)
+    check = checked(samples, tach(rng, drift=1.0)[0])
+    assert values(check, 'pulses_per_revolution', 'ratio', 'orders') == (1, 1.0, [1.0, 13.0, 26.0])
+
+
 @pytest.mark.parametrize('teeth', [(), (19, 183, 76)])
 def test_ratio_of_a_shaft_without_keyphasor(rng, teeth):
     check = checked(vibration(rng, ratio=183 / 76), tach(rng)[0], teeth=teeth)
@@ -609,6 +616,8 @@ def test_cost_of_a_run_up_is_what_the_straight_angle_law_loses():
     lost = [100.0 - 100.0 * abs(np.mean(np.exp(2j * np.pi * g * 0.01 * u * (1.0 - u))))
             for g in (20.0, 40.0)]
     np.testing.assert_allclose([cost for _, cost in found.cost], lost, rtol=0.25)
+    fitted.speed = np.full(50, 25.0)
+    assert not _of_speed(fitted, 1.0, [20.0, 40.0], None, 1e-5)
 
 
 def test_what_marks_do_not_show_of_the_speed_is_given_in_per_cent():

@@ -168,8 +168,8 @@ def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float],
             _percent(orders, turn.tolist()))]
     steady = _steady_change(fitted.speed[::max(1, fitted.pattern.present)])
     # Each change holds half of four pulse errors (s): as much is not of the speed.
-    size = math.sqrt(steady @ steady / max(steady.size, 1))
-    steady *= math.sqrt(max(0.0, 1.0 - (fitted.mean_speed * jitter / max(size, 1e-300))**2))
+    size, noise = math.sqrt(steady @ steady / max(steady.size, 1)), fitted.mean_speed * jitter
+    steady *= math.sqrt(1.0 - (noise / size)**2) if size > noise else 0.0
     loss = _of_errors(np.multiply.outer(steady, _BEND), ratio, orders)
     if max(loss) < _UNSTEADY:
         return []

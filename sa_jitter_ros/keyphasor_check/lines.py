@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import FULL_BAND, interpolate
+from scipy.interpolate import PchipInterpolator
 from scipy.fft import next_fast_len, rfft
 from scipy.special import softmax
 
@@ -127,7 +128,7 @@ def _spectrum(samples: FloatArray, places: FloatArray, turned: FloatArray) -> Fl
     """Return the amplitude spectrum (bin, channel) over the angle, `turned` at `places` (n,)."""
     points = next_fast_len(int(places[-1] - places[0]), real=True)
     angle = turned[0] + (turned[-1] - turned[0]) * np.arange(points) / points
-    position = np.interp(angle, turned, places)
+    position = PchipInterpolator(turned, places)(angle)
     over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
     over_angle -= over_angle.mean(axis=0)
     window = np.hanning(points + 1)[:-1, None]
@@ -238,8 +239,9 @@ def ratio_evidence(lines: ToothLines, teeth: Sequence[int] = ()) -> list[tuple[f
         for count in teeth:
             candidates.add(lines.places[i] / count)
         for j in strong:
-            if i < j:
-                candidates.add(abs(lines.places[i] - lines.places[j]))
+            apart = abs(lines.places[i] - lines.places[j])
+            if i != j:  # the place is as exact, and a multiple
+                candidates |= {apart, lines.places[i] / max(round(lines.places[i] / apart), 1)}
     for a in teeth:
         candidates |= {a / b for b in teeth if b != a}
     for ratio in sorted(candidates):
