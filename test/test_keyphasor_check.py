@@ -402,6 +402,14 @@ def test_pulses_that_show_nothing(times, error, message):
         checked(np.zeros((1, int(SECONDS * RATE))), np.array(times))
 
 
+@pytest.mark.parametrize(('times', 'strays'), [
+    (np.delete(np.arange(12) / 25.0, 6), 0), (np.round(np.arange(1000) / 600.0 * 2.0) / 2.0, 748)])
+def test_few_different_pulses_are_one_mark(times, strays):
+    check = checked(np.full((1, 1), np.nan), times, rate=1.0)
+    assert check.findings['pulses_per_revolution'].value == 1
+    assert check.findings['spurious'].value['count'] == strays
+
+
 @pytest.mark.parametrize('count', [50, 90, 400])
 def test_strays_alone_are_no_wheel(rng, count):
     """The message counts what does not fit, and says what to look at."""

@@ -108,8 +108,8 @@ class FittedPulses:
     @property
     def scatter(self) -> float:
         """Return how far pulses stand from a smooth motion, in s; it holds some of the motion."""
-        in_a_row = np.convolve(np.diff(self.numbers) == 1, np.ones(3), 'valid') == 3.0
-        third = np.diff(self.true, 3)[in_a_row]
+        one = np.diff(self.numbers) == 1
+        third = np.diff(self.true, 3)[one[:-2] & one[1:-1] & one[2:]]
         return max(float(np.std(third)) / math.sqrt(20.0) if third.size else 0.0, _LEAST_SCATTER)
 
     def once_a_revolution(self) -> NDArray[np.bool_]:

@@ -72,7 +72,7 @@ def number_marks(times: FloatArray) -> NumberedPulses | None:
     [19, 20, 21, 23, 24, 25]
     """
     shares, start, stop, marks = _repeating(times[:_MOST_PULSES])
-    if stop - start < _CLEAN * marks:
+    if not marks or stop - start < _CLEAN * marks:
         return None
     turns = shares[start:stop - (stop - start) % marks].reshape(-1, marks)
     widths = np.exp(np.median(turns, axis=0))
