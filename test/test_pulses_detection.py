@@ -556,6 +556,10 @@ def test_pulses_of_a_digital_input_may_be_short(level, speed, width):
     assert detect(wave, rate=1000.0)[0].size == np.count_nonzero(np.diff(wave) > 0.0)
 
 
+def test_two_samples_of_a_digital_input_have_a_pulse_and_no_warning_of_numpy():
+    assert sa.detect_pulses([0.0, 1.0], 1000.0) == pytest.approx([0.0005])
+
+
 @pytest.mark.parametrize('each', [2.2, 2.5, 3.5, 4.0])
 def test_lines_of_an_encoder_may_have_few_samples(each):
     turns = (np.arange(40_000) + 0.3) / each

@@ -220,7 +220,8 @@ def _changes_as_pulses(levels: StateLevels, samples: FloatArray, *, coarse: bool
 
 def _noise(samples: FloatArray) -> float:
     """Return the standard deviation of white noise whose second differences are as large."""
-    return float(np.median(np.abs(np.diff(samples, 2)))) / _SECOND
+    bends = np.abs(np.diff(samples, 2))
+    return float(np.median(bends)) / _SECOND if bends.size else 0.0
 
 
 def _range(samples: FloatArray) -> tuple[float, float]:
