@@ -49,7 +49,8 @@ _CACHED, _FEW = 1 << 17, 1 << 11
 # Points of a trigger cycle beside which those around its ends cost little.
 _LONG = 8 * EDGE
 # Cycles that an order may be off a whole number of them: the mean leaks by as much of itself.
-_WHOLE = 1e-9
+# Cycles of an order in an average from which on less than 0.2 % of it leaks to and fro.
+_WHOLE, _SEPARATE = 1e-9, 10.0
 # Pulses (s) of a trigger cycle, and its number since the angle was 0.
 _PLACE = np.dtype([('begin', np.float64), ('end', np.float64), ('number', np.int64)])
 
@@ -300,10 +301,10 @@ class ShaftAverager:
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_wave_mean()
         # The mean of the samples leaks into orders without whole cycles in a trigger cycle. Order
-        # 0 and, as one more channel, a signal of 1 tell how much, where an average has a cycle.
+        # 0 and, as one more channel, a signal of 1 tell how much, where an average is long enough.
         cycles = settings.cycle_length * np.array(settings.orders)
         self._leaking = (abs(cycles - np.rint(cycles)) > _WHOLE) & (
-            cycles * settings.trigger_cycles >= 1.0)
+            cycles * settings.trigger_cycles >= _SEPARATE)
         self._orders = (*settings.orders, 0.0) if self._leaking.any() else settings.orders
         # Of the latest N_t cycles: amplitudes, and what the interpolator left of them before.
         self._amplitudes = Rows(np.empty(0))
