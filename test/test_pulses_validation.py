@@ -100,6 +100,27 @@ def test_clock_of_a_few_ticks_from_mark_to_mark_costs_no_pulse(ticks):
     assert (counts.accepted, counts.cycles_discarded) == (marks.size, 0)
 
 
+@pytest.mark.parametrize(('ticks', 'marks', 'noise'), [
+    (18.0, 60, 1e-3), (18.0, 60, 0.02), (20.0, 6, 1e-4), (40.0, 1, 0.02)])
+def test_noise_on_the_ticks_of_a_clock_costs_few_cycles(rng, ticks, marks, noise):
+    """Edges between samples are off their ticks by the noise of the tach."""
+    angle = np.arange(1.0, 3000.0)
+    true = angle - 15.0 * (angle / 3000.0) ** 2  # one per cent faster at the end
+    pulses = (np.ceil(ticks * true) + rng.normal(0.0, noise, true.size)) / ticks / (20.0 * marks)
+    *_, counts = validate(pulses, pulses_per_revolution=marks)
+    assert counts.accepted >= 0.99 * true.size
+    assert counts.cycles_discarded <= 6
+    assert validate(pulses, range(7, 3000, 7), pulses_per_revolution=marks)[-1] == counts
+
+
+def test_pulses_displaced_by_the_same_are_no_tick_of_a_clock(rng):
+    pulses = np.arange(300.0) + rng.normal(0.0, 1e-4, 300)
+    pulses[40::29] += 0.05
+    times, *_, counts = validate(pulses)
+    assert not np.isin(times, pulses[40::29]).any()
+    assert counts.cycles_discarded == 2 * pulses[40::29].size
+
+
 def test_missing_pulses_break_or_are_bridged():
     gappy = np.delete(STEADY, [7, 20, 21])
     _, runs, _, counts = validate(gappy)

@@ -21,7 +21,7 @@ from sa_jitter_ros.arrays import FloatArray
 
 _FEWEST = 6  # intervals
 _DIFFERENT = 0.5  # most of the intervals that differ from all others
-_LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick
+LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick
 _WHOLE = 0.02  # ticks by which an interval may differ from a whole number of them
 _PARTS = 3  # of the smallest difference seen, that a tick may be
 _STAMP = 2.5e-9  # s, rounding of time stamps
@@ -48,7 +48,7 @@ def clock_tick(intervals: FloatArray, latest: float) -> float:
         return 0.0
     values = values[np.append(differ, True)]
     smallest = float(np.diff(values).min(initial=np.inf))
-    if not smallest <= _LONGEST_TICK * float(np.median(intervals)):
+    if not smallest <= LONGEST_TICK * float(np.median(intervals)):
         return 0.0
     for part in range(1, _PARTS + 1):
         tick = smallest / part

@@ -27,7 +27,7 @@ from operator import mul
 
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
-from sa_jitter_ros.pulses.clock_grid import clock_tick
+from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 from sa_jitter_ros.pulses.pulse_chain import robust_square
 from sa_jitter_ros.pulses.pulse_paths import LevelPrediction, OTHER, REACH
 
@@ -59,9 +59,10 @@ _FLOOR, _HARMLESS, _SAME = 1e-3, 1e-3, 3e-3
 # Of a trigger cycle: longest tick that a single step of equal intervals shows, and that a longer
 # interval beside a shorter one shows. These two may differ by _OPPOSITE of their deviation.
 _LONE_STEP, _LONE_PAIR, _OPPOSITE = 0.015, 0.006, 0.2
-# A longer step is a tick if it comes again, so many intervals later, with the same size: no
-# displaced pulse does that. By how much of it the two sizes may differ.
-_APART, _AS_LARGE = 3.0, 1e-3
+# A longer step is a tick if pulses stay so much later, or earlier, and such a step comes again, so
+# many intervals later, with the same size: a displaced pulse comes back. As many of the latest
+# _STEPS are compared as it takes until they would agree by chance once in 1000 times.
+_APART, _STEPS, _BY_CHANCE = 3.0, 8, 1e-3
 
 
 class IntervalModel:
@@ -88,6 +89,8 @@ class IntervalModel:
         self._harmless, self._same = (
             min(share * pulses_per_trigger, 0.1) for share in (_HARMLESS, _SAME))
         self._cycle = pulses_per_trigger
+        self._steps = deque[float](maxlen=_STEPS)  # sizes (s) of the latest ones in doubt
+        self._stepped = -math.inf  # time (s) of the last of these
         self._before = np.arange(block) + np.arange(REACH)[:, None]  # levels that predict others
         self.start(0.0, scatter=_PRIOR, count=1)
 
@@ -109,7 +112,6 @@ class IntervalModel:
         self._intervals = deque(intervals, maxlen=self._window)
         #: of the clock, relative to the interval, 0 for none; and when it was seen (s)
         self.tick = self._latest = 0.0
-        self._lone = -math.inf, 0.0  # time and size (s) of the latest step that is in doubt
         #: regular intervals since the beginning
         self.taken = 0
         self._set_tolerance()
@@ -188,20 +190,38 @@ class IntervalModel:
         """
         length = math.exp(self.expected)
         tick = clock_tick(np.array([*self._intervals, *intervals]), latest) / length
-        if tick <= self.tick:
-            return False
-        # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
-        lone = not clock_tick(np.array(self._intervals), latest)
         off = intervals / length - widths  # a displaced pulse: one is longer, the other shorter
         opposite = abs(off.sum()) < _OPPOSITE * np.abs(off).max()
-        if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
-            (seen, size), self._lone = self._lone, (latest, tick * length)
-            if opposite or latest - seen <= _APART * length or (
-                    abs(tick * length - size) >= _AS_LARGE * tick * length):
-                return False
+        # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
+        if tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle and not clock_tick(
+                np.array(self._intervals), latest):
+            tick = 0.0
+        tick = max(tick, self._recurring(off * length, length, latest) / length)
+        if tick <= self.tick:
+            return False
         before, self.tick, self._latest = self.tolerance, tick, latest
         self._set_tolerance()
         return self.tolerance > before
+
+    def _recurring(self, off: FloatArray, length: float, latest: float) -> float:
+        """
+        Return the size (s) of a step that pulses take again and again, 0.0 for none.
+
+        The doubtful intervals, of about this `length` (s), are `off` (n,) in s from what is
+        expected.
+        """
+        size = abs(float(off[0]))
+        if off.size < 2 or abs(off[1]) > _OPPOSITE * size or not (
+                self.tolerance < size / length <= LONGEST_TICK) or (
+                abs(latest - self._stepped) <= _APART * length):
+            return 0.0
+        self._steps.append(size)
+        self._stepped = latest
+        for count in range(2, len(self._steps) + 1):
+            sizes = np.array(self._steps)[-count:]
+            if (np.ptp(sizes) / sizes.mean())**(count - 1) < _BY_CHANCE:
+                return float(sizes.mean())
+        return 0.0
 
     def _learn(self) -> None:
         every, weight = np.array(self._levels), self.block / min(
