@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.inference import record_fit
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.loop import close_loop
@@ -112,6 +113,22 @@ def test_wrong_ratio_at_one_speed_is_said_to_be_inseparable_from_a_skew():
     assert (names(content), content['declared_changes']) == (['clock_skew'], [])
     evidence = content['missing_effects'][0]['evidence']
     assert 'instead of 1.0002 makes the same at constant speed' in evidence
+
+
+@pytest.mark.machines
+def test_nothing_is_named_or_looked_for_where_no_declared_order_stands(monkeypatch):
+    monkeypatch.setattr(record_fit, 'new_lines', None)
+    found = machine(wander=(0.03, 0.2), seconds=6.0)
+    slow = observe(replace(found, sample_rate=0.5 * RATE), replace(MODEL, sample_rate=0.5 * RATE))
+    assert (len(slow.acquisitions), slow.compared) == (5, ())
+    content = told(found, replace(MODEL, ratio=1.01))
+    assert (content['verdict'], names(content)) == ('none', [])
+    assert content['error_after']['rms'] is None
+    assert {item['reason'].split(';')[0] for item in content['not_testable']} == {
+        'no line is compared: the vibration holds no declared order'}
+    # what the pulses show by themselves
+    limit, = [item for item in content['limits'] if item['name'] == 'excess_jitter']
+    assert 0.0 < limit['upper_95'] < 1e-4
 
 
 @pytest.mark.machines

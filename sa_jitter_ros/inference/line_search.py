@@ -48,13 +48,13 @@ _SLOPE_GAIN = 0.7
 _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
 
 
-def follow_trend(states: States, expected: float) -> int:
+def follow_trend(states: States, expected: float) -> tuple[float, bool]:
     """
     Start from the slope of the errors, or the delay, that keeps the declared lines together.
 
     A clock that is fast or slow, or a wrong ratio, makes a slope, and a delay errors that follow
-    the speed. The slope is the `expected` one where nothing else is clearly better. How many were
-    tried is returned.
+    the speed. The slope is the `expected` one where nothing else is clearly better. Returned are
+    the chance that counts, as many were tried, and whether the lines are together by less.
     """
     pace = states.cycle_length / trigger_periods(states.times)
     since = states.times - states.times[0]
@@ -83,7 +83,12 @@ def follow_trend(states: States, expected: float) -> int:
     states.by_speed = errors - errors.mean() * states.common_turn - slope * states.ramp
     states.states[:, 0] = states.no_jitter
     states.read()
-    return count
+    each *= np.exp(-2j * np.pi * np.outer((pace * (errors - expected * since))[:-1],
+                                          states.orders))
+    together = np.abs(each.sum(axis=1)) ** 2 / np.maximum(
+        np.sum(np.abs(each) ** 2, axis=1), np.finfo(np.float64).tiny)
+    rare = FALSE / count
+    return rare, bool(gammaincc(together.size, together.sum()) < rare)
 
 
 def _coherence(each: ComplexArray, turns: Array, tried: Array) -> Array:

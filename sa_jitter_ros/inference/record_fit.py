@@ -22,7 +22,6 @@ import math
 
 import numpy as np
 from sa_jitter_ros.arrays import Array, BoolArray, ComplexArray
-from sa_jitter_ros.averaging.spectral_lines import FALSE
 from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
@@ -79,7 +78,11 @@ class RecordFit:
 
 
 class OpenRecord:
-    """What all fits of a stretch of a recording have in common: its band, and where they begin."""
+    """
+    What all fits of a stretch of a recording have in common: its band, and where they begin.
+
+    The declared lines are in the vibration where it `stands` together from cycle to cycle.
+    """
 
     def __init__(self, samples: Array, sample_rate: float, start_time: float, times: Array, *,
                  measured: BoolArray, cycle_length: float, orders: Sequence[float],
@@ -96,21 +99,34 @@ class OpenRecord:
         band = OrderBand.below(top * cycle_length, samples, sample_rate, start_time, times)
         self._begin = States(
             band, times, measured, cycle_length, np.array(orders), top, jitter_std)
-        self._false_alarm = FALSE / follow_trend(self._begin, trend)
+        self._false_alarm, self.stands = follow_trend(self._begin, trend)
 
     def fit(self, known: tuple[Array, Array] | None = None) -> RecordFit:
         """
         Fit the stretch.
 
         `known` are undeclared orders, and tones (Hz), of an earlier fit; then none is looked for.
+        Others are looked for beside declared lines that stand: without these, nothing is known.
         """
         states = copy(self._begin)
         states.size = states.size.copy()
         fit_lines(states)
+        if known is None and not self.stands:
+            return _unknown(states)
         _search(states, known)
         states.converged = True
         _settle(states)
         return _result(states, self._false_alarm)
+
+
+def _unknown(states: States) -> RecordFit:
+    """Return the fit of lines that do not stand: errors are as large as was expected."""
+    size, pulses, lines = states.size[:3], states.times.size, states.amplitudes
+    return RecordFit(
+        np.zeros(pulses), np.full(pulses, size[0]), math.sqrt(6.0) * size[0],
+        np.zeros((pulses - 1, 2)), np.full(2, np.inf), states.declared, states.orders,
+        states.tones, lines, np.full(lines.shape, np.inf), states.synchronous, float(size[0]),
+        size, states.trend, held=False)
 
 
 def _settle(states: States) -> None:
