@@ -31,7 +31,7 @@ from sa_jitter_ros.inference.limits import largest
 from sa_jitter_ros.inference.timing import read_timing, refitted
 from sa_jitter_ros.inference.timing_choice import Chooser, SIDEBANDS
 from sa_jitter_ros.inference.timing_data import steering, TimingData
-from sa_jitter_ros.inference.timing_fit import TimingFit
+from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from scipy import stats
 
 #: A stretch, of pulses enough for most of what is asked.
@@ -76,12 +76,26 @@ def test_effect_is_found_with_its_size(name):
 def test_parameters_that_fit_more_pulses_are_surer():
     first, second = machine(3, skew=2e-5), machine(4, skew=2e-5)
     timing = read_timing([first])
-    again = refitted(timing, [first, second], [])
+    _, again = refitted(timing, [first, second], [])
     assert names_of(again) == names_of(timing) == {'clock_skew'}
     assert again.probabilities == timing.probabilities
     value, error = value_of(again, 'clock_skew', 'skew')
     assert error == pytest.approx(value_of(timing, 'clock_skew', 'skew')[1] / np.sqrt(2.0), rel=.1)
     assert abs(value - 2e-5) < 4.0 * error
+
+
+@pytest.mark.machines
+def test_more_pulses_decide_what_odds_left_undecided():
+    """Correlation that is none is taken for some in a part: the whole tells."""
+    first, second = machine(3, excess=1.5), machine(4, excess=1.5)
+    memory, independent = (frozenset([name]) for name in ('correlated_jitter', JITTER))
+    part = read_timing([first], names=memory)
+    part.chooser.fit(independent)
+    part = replace(part, choice=part.chooser.choice(memory))
+    assert {*part.choice.undecided} == {memory, independent}
+    for found in refitted(part, [first, second], []):
+        assert names_of(found) == {'excess_jitter'}
+        assert found.findings[0].indistinguishable_from == ('correlated_jitter',)
 
 
 def without_the_middle(stretch):

@@ -208,24 +208,31 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
     return Timing(findings, _probabilities(choice, findings), chooser, choice)
 
 
-def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect]) -> Timing:
+def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect]
+             ) -> tuple[Timing, Timing]:
     """
-    Return what was chosen, with parameters that fit other stretches.
+    Return what was chosen, and that with parameters that fit other stretches.
 
-    It is `timing` itself where ticks of a clock make all errors, or where other effects result.
+    What `timing` left undecided, these decide. Both are the same where ticks of a clock make all
+    errors, or where other effects result.
     """
-    if timing.choice.quantised:
-        return timing
-    chooser, best = Chooser(parts, declared), timing.choice.best
+    choice = timing.choice
+    if choice.quantised:
+        return timing, timing
+    chooser, fits = Chooser(parts, declared), choice.fits
     # other stretches may have other sidebands
-    starts = {name: start for name, start in timing.choice.fit.starts.items() if name != SIDEBANDS}
-    fit = chooser.fit(best, starts)
-    choice = replace(timing.choice, fits={**timing.choice.fits, best: fit},
-                     setting=chooser.setting)
+    again = {names: chooser.fit(names, {name: start for name, start in fits[names].starts.items()
+                                        if name != SIDEBANDS}) for names in choice.undecided}
+    best = max(again, key=lambda names: chooser.score(names, again[names]))
+    if best != choice.best:
+        choice = replace(choice, best=best)
+        timing = replace(timing, choice=choice, findings=_findings(
+            timing.chooser, choice, declared))
+    choice = replace(choice, fits={**fits, best: again[best]}, setting=chooser.setting)
     findings = _findings(chooser, choice, declared)
     if _chosen(findings) != _chosen(timing.findings):
-        return timing
-    return Timing(findings, timing.probabilities, chooser, choice)
+        return timing, timing
+    return timing, Timing(findings, timing.probabilities, chooser, choice)
 
 
 def _chosen(findings: Sequence[Finding]) -> Sequence[str]:

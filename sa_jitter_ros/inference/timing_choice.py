@@ -93,13 +93,20 @@ class Choice:
         return {name: sum(value for key, value in odds.items() if name in key) / total
                 for name in names}
 
+    @property
+    def undecided(self) -> Sequence[frozenset[str]]:
+        """Return the best set, and those with one exchanged with odds that decide nothing."""
+        least = self.scores[self.best] - DECIDED
+        return [self.best, *(names for names, score in self.scores.items() if score > least and (
+            len(names) == len(self.best) == len(names & self.best) + 1))]
+
     def rivals(self, name: str) -> tuple[str, ...]:
         """Return what explains the data in place of `name` with odds that decide nothing."""
         if self.quantised:
             return ()
-        least = self.scores[self.best] - DECIDED
-        return tuple(other for other in self.probabilities if other not in self.best and (
-            self.scores.get((self.best - {name}) | {other}, -math.inf) > least))
+        undecided, others = self.undecided, self.best - {name}
+        return tuple(other for other in self.probabilities
+                     if other not in self.best and others | {other} in undecided)
 
 
 class Chooser:

@@ -174,8 +174,8 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     if noise is not None:
         say(f'noise of {noise[0]:.3g} per sample, '
             + ('less than declared' if observation.model.noise_is_declared else 'not declared'))
-    whole = timing and refitted(timing, stretches(observation, everything, refined.clock),
-                                refined.declared)
+    timing, whole = (timing, None) if timing is None else refitted(
+        timing, stretches(observation, everything, refined.clock), refined.declared)
     checked = _check(_search(refined, timing, whole, say), whole)
     found, scores, own = checked.found, checked.scores, checked.scores.unsteadiness
     effects, few = effects_of(found.chosen), partial(found.bench.change, chosen=found.bench.few)
