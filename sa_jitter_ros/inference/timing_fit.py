@@ -220,9 +220,9 @@ class TimingFit:
         if not self.columns:
             return np.zeros(0), np.zeros((0, 0))
         inverse = np.linalg.inv(spectrum)[self.data.bin] * self.data.weight[:, None, None]
-        weighted = np.einsum('fij,fjp->fip', inverse, self.matrix)
-        normal = 2.0 * np.einsum('fip,fiq->pq', self.matrix.conj(), weighted).real
-        right = 2.0 * np.einsum('fip,fi->p', weighted.conj(), self.ordinates).real
+        weighted = (inverse @ self.matrix).reshape(-1, self.matrix.shape[-1])
+        normal = 2.0 * (self.matrix.reshape(weighted.shape).conj().T @ weighted).real
+        right = 2.0 * (weighted.conj().T @ self.ordinates.ravel()).real
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         covariance = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-10) / np.outer(
             scale, scale)
