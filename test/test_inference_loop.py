@@ -152,7 +152,7 @@ def test_errors_of_all_stretches_are_against_the_vibration_or_all_against_the_re
 @pytest.mark.machines
 def test_moving_source_takes_from_the_average_with_a_reference_keyphasor_too():
     # An average with the reference keyphasor shows nothing of the loss that the wander makes.
-    found = traced(*make_effects({'phase_wander': {'std': 0.006}}), acquisitions=24,
+    found = traced(*make_effects({'phase_wander': {'std': 0.006}}), acquisitions=20,
                    reference=True)
     assert found.observation.against_reference
     assert [item.name for item in found.findings] == ['phase_wander']
@@ -183,7 +183,7 @@ def test_declared_model_suffices(plain):
                  marks=pytest.mark.machines),
 ])
 def test_effect_on_the_mean_is_traced(name, values, parameter):
-    content = report(traced(*make_effects({name: values}), acquisitions=16))
+    content = report(traced(*make_effects({name: values})))
     assert content['verdict'] == 'traced'
     assert [item['name'] for item in content['missing_effects']] == [name]
     stated = content['probabilities']
@@ -280,7 +280,7 @@ def test_effect_of_no_module_stays_unexplained():
 def test_missing_pulses_hide_no_modulation():
     effects = make_effects({'amplitude_modulation': {'std': 0.2, 'bandwidth': 0.03},
                             'missing_pulses': {'probability': 0.015}})
-    found = traced(*effects, acquisitions=16)
+    found = traced(*effects, acquisitions=12)
     assert {item.name for item in found.findings} == {'amplitude_modulation', 'missing_pulses'}
 
 
@@ -754,7 +754,7 @@ def saved(folder, recording):
 @pytest.mark.usefixtures('undrawn')
 def test_command_writes_the_report(tmp_path, capsys):
     arguments = saved(tmp_path, simulated(*make_effects({'clock_skew': {'skew': 4e-4}}),
-                                          acquisitions=10))
+                                          acquisitions=8))
     assert main(arguments) == 0
     printed = capsys.readouterr()
     assert 'missing effect: clock_skew' in printed.out
