@@ -53,8 +53,8 @@ def run_up():
 
 @pytest.fixture(scope='module')
 def noisy():
-    """Return vibration, angle and found pulses of four machines in much noise."""
-    machines = [made(seed, noise=2.0, seconds=10.0) for seed in range(4)]
+    """Return vibration, angle and found pulses of three machines in much noise."""
+    machines = [made(seed, noise=2.0, seconds=10.0) for seed in range(3)]
     return [(vibration, angle, sa.find_pulses(
         vibration, RATE, orders=ORDERS, speed_range=RANGE)) for vibration, angle in machines]
 
