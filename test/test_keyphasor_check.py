@@ -131,7 +131,7 @@ def test_marks_have_their_places_and_errors(rng):
 
 def test_even_marks_of_which_many_are_lost_have_no_pattern(rng):
     """A stray that stands far from all marks speaks for no gap in which it stands."""
-    for _ in range(6):
+    for _ in range(4):
         turns = np.flatnonzero(rng.random(4000) > 0.2) / 4.0 + rng.normal(0.0, 1e-4, 1)
         turns += rng.normal(0.0, 1e-4, turns.size)
         strays = rng.uniform(0.0, turns[-1], int(rng.integers(20, 200)))
@@ -153,8 +153,7 @@ def test_the_clock_of_pulses_makes_no_unsteady_speed(rng):
     assert 'unsteady_speed' not in codes(check)
 
 
-@pytest.mark.parametrize('hunting', [0.0, 0.05, 0.5])
-@pytest.mark.parametrize('clock', [1e4, 2e4])
+@pytest.mark.parametrize(('hunting', 'clock'), [(0.0, 2e4), (0.05, 1e4), (0.5, 2e4)])
 def test_a_slow_hunting_of_the_speed_and_the_beat_of_a_clock_are_no_wheel(hunting, clock):
     """The speed repeats after 1170 teeth, and the ticks of 20 kHz after 117."""
     time = np.linspace(0.0, 20.0, 200_001)
@@ -170,7 +169,7 @@ def test_a_slow_hunting_of_the_speed_and_the_beat_of_a_clock_are_no_wheel(huntin
 @pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'orders'), [
     (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS),
-    *((marks, ((1.0, 1.0), (19.0, 0.6), (38.0, 0.3))) for marks in (20, 36, 60))])
+    *((marks, ((1.0, 1.0), (19.0, 0.6), (38.0, 0.3))) for marks in (20, 60))])
 def test_lines_of_the_vibration_tell_even_marks(rng, marks, orders):
     check = checked(vibration(rng, orders=orders), tach(rng, marks)[0])
     count = check.findings['pulses_per_revolution']
@@ -455,11 +454,11 @@ def test_delay_of_the_tach_turns_all_orders_alike(rng, delay):
 
 @pytest.mark.machines
 def test_delay_has_the_error_that_is_stated(rng):
-    """Over 8 drawn machines whose speed hardly changes: all pulses of one turn all orders."""
+    """Over 6 drawn machines whose speed hardly changes: all pulses of one turn all orders."""
     found = [checked(vibration(rng, drift=0.05), tach(rng, drift=0.05, jitter=2e-5)[0]).findings[
-        'path_delay'] for _ in range(8)]
+        'path_delay'] for _ in range(6)]
     known = [item.value / item.standard_error for item in found if item.value is not None]
-    assert len(known) >= 6
+    assert len(known) >= 5
     assert np.sqrt(np.mean(np.square(known))) < 1.8
 
 
