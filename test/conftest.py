@@ -63,10 +63,21 @@ def undrawn(monkeypatch):
     monkeypatch.setattr('matplotlib.figure.Figure.draw', lambda figure, renderer: None)
 
 
+UNDECIDED = 'sa_jitter_ros.inference.trace.undecided_effects', lambda *_: ()
+
+
 @pytest.fixture
 def unasked(monkeypatch):
     """Leave out of a trace what stays undecided, which takes a third of its time."""
-    monkeypatch.setattr('sa_jitter_ros.inference.trace.undecided_effects', lambda *_: ())
+    monkeypatch.setattr(*UNDECIDED)
+
+
+@pytest.fixture(scope='module')
+def all_unasked():
+    """Leave it out of all traces of a file, those of its fixtures, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(*UNDECIDED)
+        yield
 
 
 @pytest.fixture(scope='session')

@@ -60,7 +60,7 @@ def traced(marks=1, **effects):
 
 
 @pytest.fixture(scope='module')
-def traces():
+def traces(all_unasked):
     """Yield traces of each verdict."""
     found = {'none': traced(), 'traced': traced(excess_jitter={'std': 5e-5}),
              'geometry': traced(3, target_geometry={'pulse_angles': (0.0, 0.006, -0.004)}),
