@@ -43,9 +43,9 @@ def _said(times, marks, blocks=7):
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('marks', [1, 2, 3, 4])
-@pytest.mark.parametrize(('share', 'off'), [(0.2, 0.3), (0.4, -0.1), (0.4, 0.4)])
-def test_a_loose_mark_is_said_once(marks, share, off):
+@pytest.mark.parametrize(('share', 'off', 'marks'), [
+    *((0.2, 0.3, marks) for marks in (1, 2, 3, 4)), (0.4, -0.1, 1), (0.4, -0.1, 4), (0.4, 0.4, 2)])
+def test_a_loose_mark_is_said_once(share, off, marks):
     times = _times(3, marks, share=share, off=off)
     (line,), displaced = _said(times, marks)
     assert f'of {marks}, counted' in line
@@ -58,7 +58,7 @@ def test_a_loose_mark_is_said_once(marks, share, off):
 @pytest.mark.parametrize('machine', [
     {'jitter': 0.01}, {'jitter': 0.03}, {'scatter': 0.3}, {'ramp': 0.3}, {'ramp': -0.3}])
 def test_no_other_machine_has_a_loose_mark(marks, machine):
-    for seed in range(3):
+    for seed in range(2):
         assert _said(_times(seed, marks, **machine), marks) == ([], 0)
 
 

@@ -292,7 +292,7 @@ def test_minimum_interval_removes_a_burst():
 
 
 @pytest.mark.machines
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 600), max_size=30),
        wheel_teeth=st.booleans(), bridge=st.booleans())
 def test_every_cutting_gives_the_same_result(seed, cuts, wheel_teeth, bridge):
@@ -530,12 +530,12 @@ def test_the_first_revolutions_of_two_marks_lose_no_pulse_by_jitter():
     """By chance some revolutions of two marks repeat more narrowly than the jitter is."""
     rng = np.random.default_rng(1)
     accepted = 0
-    for _ in range(60):
+    for _ in range(40):
         count = 320
         speed = 1.0 + 2e-3 * np.sin(2.0 * np.pi * np.arange(count) / rng.uniform(50.0, 400.0))
         times = 0.02 * (np.cumsum(speed) + rng.uniform(-0.01, 0.01, count))
         accepted += validate(times, pulses_per_revolution=2, missing_pulses='bridge')[3].accepted
-    assert accepted >= 60 * 320 - 8
+    assert accepted >= 40 * 320 - 5
 
 
 def test_pulses_that_no_lock_keeps_are_tried_seldom(rng, monkeypatch):
@@ -589,7 +589,7 @@ def uneven_encoder(rng, scatter, alike, count=800):
 def test_a_clean_encoder_on_a_machine_that_turns_unevenly_loses_next_to_nothing(scatter, alike):
     """Intervals of a speed that scatters by 30 % change by a factor of 0.4 to 2.4."""
     lost = 0
-    for seed in range(3):
+    for seed in range(2):
         pulses = uneven_encoder(np.random.default_rng(seed), scatter, alike)
         found, *_, counts = validate(pulses, pulses_per_revolution=16)
         assert np.isin(found, pulses).all()
@@ -599,7 +599,7 @@ def test_a_clean_encoder_on_a_machine_that_turns_unevenly_loses_next_to_nothing(
             parts, *_, of_parts = validate(pulses, cuts, pulses_per_revolution=16)
             assert np.array_equal(parts, found)
             assert of_parts == counts
-    assert lost <= 0.01 * 3 * 800
+    assert lost <= 0.01 * 2 * 800
 
 
 def test_an_encoder_of_a_motor_that_turns_unevenly_loses_nothing(shared_data):
@@ -618,7 +618,7 @@ def test_an_encoder_of_a_motor_that_turns_unevenly_loses_nothing(shared_data):
 def test_lost_pulses_beside_jitter_are_missing(jitter):
     """Of 36 marks 3 % are lost, whose neighbours are displaced by up to a tenth of an interval."""
     missing = lost = turns = unused = 0
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng([seed, 36])
         true = 1.0 + np.arange(3600) / (36 * 25.0)
         there = rng.random(true.size) > 0.03
@@ -632,8 +632,8 @@ def test_lost_pulses_beside_jitter_are_missing(jitter):
         unused += pulses.size - counts.accepted + counts.late
         turns += cycles.size
     assert missing == pytest.approx(lost, rel=0.03)
-    assert unused <= 2e-3 * 6 * 3600
-    assert turns >= 0.97 * 6 * 99
+    assert unused <= 2e-3 * 4 * 3600
+    assert turns >= 0.97 * 4 * 99
 
 
 @pytest.mark.machines
@@ -641,7 +641,7 @@ def test_lost_pulses_beside_jitter_are_missing(jitter):
 def test_missing_pulses_are_no_speed_that_scatters(share):
     """Of one mark with jitter of up to 3 %, from which up to a third of the pulses is missing."""
     wrong = found = 0
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         marks = np.arange(600) / 30.0
         pulses = (marks + (1e-4, 1e-2, 3e-2)[seed % 3] / 30.0 * rng.normal(size=600))
