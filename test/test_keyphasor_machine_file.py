@@ -33,7 +33,7 @@ from sa_jitter_ros.offline.settings import averager_values, MachineFile
 from sa_jitter_ros.recordings import ArraySource, read
 from sa_jitter_ros.recordings.npz_format import write_npz
 
-pytestmark = pytest.mark.usefixtures('undrawn')
+pytestmark = pytest.mark.usefixtures('undrawn', 'unasked')
 
 RATE = 5120.0
 
@@ -97,7 +97,10 @@ def test_a_short_recording_is_averaged_and_says_what_is_too_short(checked, capsy
 
 @pytest.mark.machines
 def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(checked, capsys):
-    text, _ = run_all(checked(24, marks=60, missing=2, torsion=np.radians(3.4)), capsys)
+    folder = checked(12, marks=60, missing=2, torsion=np.radians(3.4))  # of so few it is taken
+    angles = re.search(r'target_angles: \[(.*)\]', (folder / 'machine.yaml').read_text())[1]
+    assert max(float(angle) for angle in angles.split(',')) > np.pi / 60  # for uneven marks
+    text, _ = run_all(folder, capsys)
     assert 'averages of 1 recording' in text
 
 
@@ -236,7 +239,7 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     path = shared_data / f'{name}.npz'
     recording = read(path, pulses_suffice=True, **fields)
     if recording.samples * recording.channels > 200_000:  # all would be corrected
-        recording, path = cut(recording, 4.0, channels=1), tmp_path / path.name
+        recording, path = cut(recording, 2.5, channels=1), tmp_path / path.name
         write_npz(path, recording)
     if name in KNOWN:
         check = keyphasor.check_keyphasor(replace(recording, pulses_per_revolution=1, orders=()))
