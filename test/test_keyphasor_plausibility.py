@@ -239,6 +239,7 @@ def test_player_plays_the_good_channels_and_warns(recording, tmp_path, ros_graph
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('unasked')
 def test_loop_uses_the_good_channels_and_warns(recording):
     bad = with_bad_channels(recording)
     holes = np.vstack((bad.read(), recording.read()))
@@ -257,7 +258,7 @@ def test_loop_uses_the_good_channels_and_warns(recording):
 
 
 @pytest.mark.machines
-@pytest.mark.usefixtures('undrawn')
+@pytest.mark.usefixtures('undrawn', 'unasked')
 def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
     write_npz(tmp_path / 'rig.npz', with_bad_channels(recording))
     (tmp_path / 'model.yaml').write_text('jitter_predictor:\n  ros__parameters:\n' + ''.join(
