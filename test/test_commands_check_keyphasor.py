@@ -96,7 +96,7 @@ def test_machine_file_starts_every_node(name, written, recording, ros_graph):
 
 
 @pytest.mark.machines
-@pytest.mark.usefixtures('undrawn')
+@pytest.mark.usefixtures('undrawn', 'unasked')
 def test_machine_file_declares_the_machine_to_the_commands(
         written, recording, capsys, monkeypatch):
     machine = written / 'machine.yaml'

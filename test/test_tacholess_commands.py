@@ -80,7 +80,7 @@ def test_lost_tach_is_bridged(folder, capsys):
 
 
 @pytest.mark.machines
-@pytest.mark.usefixtures('undrawn')
+@pytest.mark.usefixtures('undrawn', 'unasked')
 def test_check_and_loop_without_a_tach(folder, capsys):
     assert check_keyphasor.main([str(folder / 'rig.npz'), *TACHOLESS, '--output',
                                  str(folder / 'found'), '--quiet']) == 0
@@ -135,7 +135,7 @@ def test_orders_of_the_machine_file_and_a_second_run(folder, capsys):
 
 
 @pytest.mark.machines
-@pytest.mark.usefixtures('undrawn')
+@pytest.mark.usefixtures('undrawn', 'unasked')
 def test_loop_of_a_folder_without_a_tach(folder):
     several = folder / 'several'
     several.mkdir()
