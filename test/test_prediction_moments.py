@@ -94,7 +94,7 @@ def test_moments_and_third_cumulants_agree_with_monte_carlo(distribution, cycles
     jitter = [IndependentPulseJitter(distribution)]
     single = cycle_moments([order], jitter)
     moments = single.averaged(cycles)
-    draws = averages(distribution.draw(rng, (40_000, cycles + 1)), order)
+    draws = averages(distribution.draw(rng, (25_000, cycles + 1)), order)
     assert_moments(draws, moments)
     off = draws - moments.mean[0]
     for sample, expected in zip((off**3, off * np.abs(off) ** 2),
@@ -181,7 +181,7 @@ def test_known_pulse_errors_beside_random_jitter(rng):
 
     moments = scenario_moments(unit_model(cycles, 0.8), [IndependentPulseJitter(Triangular(0.1))],
                                known[None])
-    errors = Triangular(0.1).draw(rng, (60_000, cycles + 1))
+    errors = Triangular(0.1).draw(rng, (30_000, cycles + 1))
     assert_moments(averages(errors, 0.8, offset), moments.of(0))
 
 

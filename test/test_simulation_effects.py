@@ -147,11 +147,11 @@ def test_effects_on_pulses_leave_the_vibration_alone():
 @pytest.mark.machines
 def test_acceleration_of_the_shaft():
     gearbox = machine(one('speed_fluctuation', acceleration_std=2.0))
-    times, step = np.arange(0, 2000.0, 0.01), 1e-4
+    times, step = np.arange(0, 1000.0, 0.01), 1e-4
     speed = [2 * np.pi * gearbox.shaft_speed(times + shift) for shift in (-step, step)]
     acceleration = (speed[1] - speed[0]) / (2 * step)
     # A bandwidth of 0.15 x 25 Hz gives about 2 x 3.75 independent values a second.
-    assert np.std(acceleration) == pytest.approx(2.0, rel=4 / np.sqrt(2 * 7.5 * 2000))
+    assert np.std(acceleration) == pytest.approx(2.0, rel=4 / np.sqrt(2 * 7.5 * 1000))
     # Over half a trigger cycle, 20 ms, the acceleration hardly changes: mean of cos(pi f / 25 Hz).
     assert correlation(acceleration, 2) == pytest.approx(0.92, abs=0.03)
     assert abs(np.mean(speed) / (2 * np.pi * SPEED) - 1) < 1e-4
@@ -169,9 +169,9 @@ def cycle_amplitudes(gearbox, orders, cycles):
 def test_phase_wander_attenuates_all_orders_of_a_shaft_alike():
     std = 0.12
     gearbox = machine(one('phase_wander', std=std), orders=(4.0, 8.0))
-    first, second = cycle_amplitudes(gearbox, (4.0, 8.0), 8000)
+    first, second = cycle_amplitudes(gearbox, (4.0, 8.0), 4000)
     # 0.38 of the trigger rate as bandwidth: 0.76 independent values a cycle.
-    se = 1 / np.sqrt(0.76 * 8000)
+    se = 1 / np.sqrt(0.76 * 4000)
     for order, got in ((4, first), (8, second)):
         variance = 1 - np.exp(-(order * std) ** 2)
         wanted = np.exp(-((order * std) ** 2) / 2)
@@ -183,16 +183,16 @@ def test_phase_wander_attenuates_all_orders_of_a_shaft_alike():
 def test_phase_wander_differs_between_shafts():
     gearbox = Gearbox(tuple(Component(name, 4.0, (1.0,), (0.0,)) for name in 'ab'), 5000.0,
                       shafts={'a': 1.0, 'b': 2.0}, effects=(one('phase_wander', std=0.1),))
-    first, second = np.angle(cycle_amplitudes(gearbox, (4.0, 8.0), 4000))
+    first, second = np.angle(cycle_amplitudes(gearbox, (4.0, 8.0), 2000))
     assert np.std(first) > 0.3
-    assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(0.76 * 4000)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(0.76 * 2000)
 
 
 @pytest.mark.machines
 def test_amplitude_modulation_scatters_without_bias():
     gearbox = machine(one('amplitude_modulation', std=0.2), orders=(4.0, 8.0))
-    first, second = cycle_amplitudes(gearbox, (4.0, 8.0), 8000)
-    se = 1 / np.sqrt(0.76 * 8000)
+    first, second = cycle_amplitudes(gearbox, (4.0, 8.0), 4000)
+    se = 1 / np.sqrt(0.76 * 4000)
     assert np.mean(first).real == pytest.approx(1.0, abs=4 * 0.2 * se)
     # The mean over a cycle smooths what lies below 0.4 of the trigger rate by up to sinc(0.4).
     assert 0.8 * 0.2 < np.std(first.real) < 0.2 * (1 + 4 * se)
