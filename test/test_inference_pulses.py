@@ -85,7 +85,7 @@ def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
 
 @pytest.mark.machines
 def test_pulses_may_be_missing_in_every_acquisition():
-    recording = simulated(acquisitions=14)
+    recording = simulated()
     lost = np.delete(recording.pulse_times, np.arange(7, recording.pulse_times.size, 13))
     found = traced(replace(recording, pulse_times=lost))
     assert all(item.missing.any() for item in found.observation.acquisitions)
@@ -184,11 +184,20 @@ def geared(marks, step):
     """Return the machine with a target that turns once in `marks` / `step` cycles."""
     model = replace(MODEL, pulses_per_revolution=marks, pulses_per_trigger=step,
                     trigger_speed=SPEED * step / marks, ratio=marks / step)
-    recording = simulated(acquisitions=16)
+    recording = simulated()
     times = recording.pulse_times
     count = step * (times.size - 1) + 1
     return replace(recording, pulse_times=np.interp(
         np.arange(count) / step, np.arange(times.size), times)), model
+
+
+@pytest.fixture(scope='module')
+def late_marks():
+    """Return delays (s) of four marks, the recording, its model, and what is traced of them."""
+    recording, model = geared(4, 1)
+    late = np.array([2e-4, -1e-4, 0.0, -1e-4])
+    recording = delayed(recording, late)
+    return late, recording, model, traced(recording, model)
 
 
 def delayed(recording, late):
@@ -210,10 +219,9 @@ def test_errors_that_repeat_with_no_revolution_are_no_target(marks, step):
 
 
 @pytest.mark.machines
-def test_errors_that_repeat_with_the_revolution_are_a_target():
-    recording, model = geared(4, 1)
-    truth = np.array([2e-4, -1e-4, 0.0, -1e-4])
-    (finding,) = traced(delayed(recording, truth), model).findings
+def test_errors_that_repeat_with_the_revolution_are_a_target(late_marks):
+    truth, _, model, found = late_marks
+    (finding,) = found.findings
     rad = 2.0 * np.pi * model.trigger_speed
     off = np.array(finding.effect.pulse_angles) - rad * truth
     assert np.abs(off).max() < 4.0 * finding.standard_errors['pulse_angles'][0]
@@ -248,12 +256,10 @@ def test_another_rate_of_the_tach_is_remarked(rate, said):
 
 
 @pytest.mark.machines
-def test_declared_speed_does_not_enter_what_is_fitted():
+def test_declared_speed_does_not_enter_what_is_fitted(late_marks):
     """Fit and prediction share the measured speed; the report keeps the declared one."""
-    recording, model = geared(4, 1)
-    late = delayed(recording, [2e-4, -1e-4, 0.0, -1e-4])
-    right, found = (traced(late, replace(model, trigger_speed=share * model.trigger_speed))
-                    for share in (1.0, 1.08))
+    _, recording, model, right = late_marks
+    found = traced(recording, replace(model, trigger_speed=1.08 * model.trigger_speed))
     (finding,), (expected,) = found.findings, right.findings
     np.testing.assert_allclose(finding.effect.pulse_angles, expected.effect.pulse_angles)
     assert found.after.rms == pytest.approx(right.after.rms)

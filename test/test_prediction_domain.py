@@ -59,7 +59,7 @@ def anywhere(draw, most_cycles=1_000_000):
 
 
 @pytest.mark.machines
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=36, deadline=None)
 @given(anywhere())
 def test_moments_and_quantiles_are_in_order_everywhere(setting):
     prediction = setting.predict()
@@ -138,7 +138,7 @@ def test_quantiles_of_pulses_that_are_not_independent_have_their_ranks(effects, 
     values = effects.get('correlated_jitter', {'std': 0.0, 'correlation': 0.0})
     found = sa.predict(keyphasor_rate=5e3, trigger_speed=20.0, orders=[50.0], effects=effects,
                        trigger_cycles=cycles)
-    white = rng.standard_normal((40_000, cycles + 1))
+    white = rng.standard_normal((20_000, cycles + 1))
     white[:, 1:] *= np.sqrt(1.0 - values['correlation']**2)
     errors = (values['std'] * lfilter([1.0], [1.0, -values['correlation']], white, axis=1)
               + rng.uniform(-1e-4, 1e-4, white.shape) + skew * np.arange(cycles + 1) / 20.0)
@@ -179,7 +179,7 @@ def test_single_cycles_are_as_a_quadrature_says():
 
 
 @pytest.mark.machines
-@settings(max_examples=14, deadline=None)
+@settings(max_examples=9, deadline=None)
 @given(anywhere(most_cycles=1000), logarithmic(1e-9, 1e-3))
 def test_without_jitter_nothing_is_lost(setting, factor):
     """Mean and standard deviation go to their limits as the square of the errors."""
