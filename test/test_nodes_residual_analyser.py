@@ -34,6 +34,7 @@ from sa_jitter_ros.simulation import (AdditiveNoise, band_limited, DeclaredJitte
                                       make_effects, mesh)
 from std_msgs.msg import Float64MultiArray, String
 
+pytestmark = pytest.mark.usefixtures('unasked')
 RATIO, SPEED, CLOCK, CYCLES = 183 / 76, 25.0, 20000.0, 25
 MODEL = DeclaredModel(keyphasor_rate=CLOCK, trigger_speed=SPEED, trigger_cycles=CYCLES,
                       orders=(19.0, 38.0), ratio=RATIO)
