@@ -107,7 +107,7 @@ def test_errors_of_a_run_up_are_right_at_every_speed(rng, delay, skew):
     ('clock_skew', 'skew', 8e-5, {'skew': 8e-5}),
 ])
 def test_what_turns_the_lines_as_the_speed_changes_is_found(rng, name, parameter, true, machine):
-    recording, _ = run_up(rng, **machine)
+    recording, _ = run_up(rng, stretch=0.6, **machine)
     content = traced(recording)
     effect, = content['missing_effects']
     found = effect['parameters'][parameter]
