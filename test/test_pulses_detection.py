@@ -431,7 +431,7 @@ def far(times, bad, reach):
 @pytest.mark.machines
 def test_spoilt_samples_cost_only_the_pulses_near_them():
     """Whatever their number, place and size: all but those within 1 s or 10 turns are the same."""
-    wrong, trials = 0, 60
+    wrong, trials = 0, 50
     for seed in range(trials):
         rng = np.random.default_rng(seed)
         speed, rate = rng.uniform(5.0, 50.0), rng.choice([2000.0, 5000.0, 10_000.0])
@@ -508,7 +508,7 @@ def slow_shaft(speed, marks, rate, seconds, *, noise=0.01):
     (0.3, [0.0], 200.0, 60.0)])
 def test_windows_grow_until_they_hold_whole_pulses_of_a_slow_shaft(
         speed, marks, rate, seconds):
-    for noise, sign in ((0.0, -1.0), (0.01, 1.0), (0.03, -1.0)):
+    for noise, sign in ((0.0, -1.0), (0.02, 1.0)):
         wave, passes = slow_shaft(speed, marks, rate, seconds, noise=noise)
         polarity = 'positive' if sign > 0.0 else 'negative'
         found, detector = detect(sign * wave, rate=rate, polarity=polarity,
