@@ -62,7 +62,7 @@ def hold(found, trials):
     (6, 0.01, 0.3), (10, 0.01, 0.02), (10, 0.05, 0.3),
     pytest.param(40, 0.01, 0.8, marks=pytest.mark.machines)])
 def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
-    trials, rng = 400, np.random.default_rng(count)
+    trials, rng = 250, np.random.default_rng(count)
     means, along, phase, upper, turned = [], [], [], [], []
     for _ in range(trials):
         cycles, true = cycles_of(rng, count, noise=noise, turn=turn)
@@ -92,7 +92,7 @@ def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
     pytest.param(40, 0.6, 'normal', marks=pytest.mark.machines)])
 def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
     """The correction tells the size and the kurtosis of the pulse errors, and the noise."""
-    trials, rng, noise = 300, np.random.default_rng(count + int(10 * turn)), 0.01
+    trials, rng, noise = 200, np.random.default_rng(count + int(10 * turn)), 0.01
     size, along, phase, turned, absent = [], [], [], [], []
     for _ in range(trials):
         errors = (rng.standard_normal(count + 1) if shape == 'normal'
@@ -120,7 +120,7 @@ def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
 @pytest.mark.parametrize(('count', 'turn', 'weak'), [(20, 0.3, 0.1), (40, 0.8, 0.03)])
 def test_errors_of_a_sideband_hold_what_jitter_leaks_into_the_mean(count, turn, weak):
     """Into single cycles the strong order leaks much more, which the next cycle takes back."""
-    trials, rng, orders = 300, np.random.default_rng(count), ORDERS.copy()
+    trials, rng, orders = 200, np.random.default_rng(count), ORDERS.copy()
     orders[WEAK] = ORDERS[0] + 1.0
     size, along = [], []
     for _ in range(trials):
@@ -135,7 +135,7 @@ def test_errors_of_a_sideband_hold_what_jitter_leaks_into_the_mean(count, turn, 
 @pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
 def test_corrected_errors_are_the_distance_from_the_truth():
     """Also of the phase, which the mean of the pulse errors turns, and which no one can know."""
-    rng, trials, count = np.random.default_rng(4), 50, 10
+    rng, trials, count = np.random.default_rng(4), 36, 10
     orders, size = np.array([8.0, 16.0, 21.0, 11.0]), np.array([0.5, 1.0, 0.04, 0.0])
     rate, speed, clock = 4000.0, 25.0, 1200.0
     times = np.arange(round(17 / speed * rate)) / rate
@@ -165,7 +165,7 @@ def test_corrected_errors_are_the_distance_from_the_truth():
 @pytest.mark.parametrize(
     ('count', 'turn', 'ratio'), [(10, 0.3, 1.0), (40, 0.8, 1.0), (10, 0.3, 2.4)])
 def test_errors_of_a_waveform_hold_the_jitter_that_neighbouring_cycles_share(count, turn, ratio):
-    rng, trials, rate, speed = np.random.default_rng(count), 60, 8000.0, 25.0
+    rng, trials, rate, speed = np.random.default_rng(count), 40, 8000.0, 25.0
     times = np.arange(round((count + 7) / speed * rate)) / rate
     true, orders = (2.0 + np.arange(count + 4.0)) / speed, ORDERS[STRONG]
     wave = (AMPLITUDES[STRONG] * np.exp(1j * PHASES[STRONG])) @ np.exp(
@@ -192,7 +192,7 @@ def test_upper_limit_holds_for_any_amplitude(true):
 
 def test_upper_limit_without_correction_is_that_before_the_loss():
     rng, upper = np.random.default_rng(3), []
-    for _ in range(200):
+    for _ in range(120):
         cycles, _ = cycles_of(rng, 40, noise=0.01, turn=0.8)
         upper.append(Repeatability.of(cycles, cycles, ORDERS).errors(cycles.mean(axis=0)).upper_95)
     assert np.all(np.mean(np.array(upper)[:, 0] >= AMPLITUDES, axis=0) > 0.92)
