@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 import tacholess as benchmark
 
 RATE = 4096.0
-SECONDS = 12.0
+SECONDS = 10.0
 TIMES = np.arange(int(SECONDS * RATE)) / RATE
 
 
