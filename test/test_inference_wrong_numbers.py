@@ -33,7 +33,7 @@ MODEL = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycle
 
 
 def machine(*, swing=0.02, late=0.0, tone=(0.0, 0.0), wander=(0.0, 0.0), scale=1.0, rise=0.0,
-            clock=0.0, source_rate=RATE, seconds=16.0):
+            clock=0.0, source_rate=RATE, seconds=12.0):
     """
     Return a recording of a shaft whose speed swings by a part of it, and rises by another.
 
@@ -87,7 +87,7 @@ def test_wrong_ratio_grows_with_the_angle_where_the_speed_changes(tmp_path):
 
     Another one is refused with that; a declared skew may grow with the angle.
     """
-    recording = replace(machine(), ratio=0.999)
+    recording = replace(machine(seconds=16.0), ratio=0.999)
     loop = close_loop(recording, {
         'keyphasor_rate': MODEL.keyphasor_rate, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,
         'orders': list(ORDERS), 'noise_std': NOISE, 'ratio': 0.999})
@@ -133,7 +133,7 @@ def test_nothing_is_named_or_looked_for_where_no_declared_order_stands(monkeypat
 
 @pytest.mark.machines
 def test_path_delay_does_not_depend_on_the_angle_that_all_lines_turn_by():
-    delayed = machine(late=2e-3)
+    delayed = machine(late=2e-3, seconds=16.0)
     content = told(delayed)
     assert names(content) == ['path_delay']
     value, error = parameter(content, 'delay')
@@ -197,7 +197,7 @@ def test_noise_that_is_declared_in_another_unit_ends_in_no_error():
 def test_tone_that_hides_its_order_is_named():
     """An order that a tone makes too unsteady to be compared is what the tone disturbs."""
     frequency = 40.0 * SPEED + 0.3
-    content = told(machine(swing=0.01, tone=(frequency, 0.6)))
+    content = told(machine(swing=0.01, tone=(frequency, 0.6), seconds=16.0))
     assert names(content) == ['interfering_tone']
     assert 40.0 not in [item['order'] for item in content['lines']]
     for name, true in (('frequency', frequency), ('amplitude', 0.6)):
