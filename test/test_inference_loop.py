@@ -177,6 +177,14 @@ def test_declared_model_suffices(plain):
     assert 0.3 < content['error_before']['chi2_per_dof'] < 2.0
 
 
+@pytest.mark.machines
+def test_few_acquisitions_leave_undecided_what_more_exclude(plain, monkeypatch):
+    """What their limits leave room for would still change an average."""
+    monkeypatch.undo()
+    assert 'excess_jitter' in traced(acquisitions=4).undecided
+    assert plain.undecided == ()
+
+
 @pytest.mark.parametrize(('name', 'values', 'parameter'), [
     ('excess_jitter', {'std': 80e-6}, 'std'),
     pytest.param('missing_pulses', {'probability': 0.015}, 'probability',
