@@ -129,7 +129,7 @@ def everything():
 
 
 @pytest.mark.machines
-@settings(max_examples=15)
+@settings(max_examples=9)
 @given(cuts=st.lists(st.integers(0, 9000), max_size=6))
 def test_signals_do_not_depend_on_the_cuts(everything, cuts):
     cut, vibration, waveform, wanted = everything
