@@ -76,10 +76,10 @@ def turning_order(rng, share):
 @pytest.mark.parametrize('share', [0.2, 1.0])
 def test_order_that_turns_by_itself_from_cycle_to_cycle_is_no_common_motion(rng, share):
     """On some machines pulse errors take its turn for theirs, and sidebands make up for it."""
-    found = [turning_order(child, share) for child in rng.spawn(6)]
+    found = [turning_order(child, share) for child in rng.spawn(4)]
     assert all('from cycle to cycle' in item.text for item in found)
     seen = sum(item.p_value < 1e-6 for item in found)
-    assert seen >= 4 if share < 1.0 else min(item.p_value for item in found) > 0.01
+    assert seen >= 3 if share < 1.0 else min(item.p_value for item in found) > 0.01
 
 
 @pytest.mark.parametrize('event', ['none', 'step', 'loss'])

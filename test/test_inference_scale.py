@@ -87,7 +87,7 @@ def test_small_unexplained_scatter_is_unsteadiness(recording, observation, rng):
 def test_levels_of_few_averages_are_part_of_the_scale(recording, observation, rng):
     few = replace(observation, acquisitions=observation.acquisitions[:8])
     size, found = 0.02, []
-    for _ in range(40):
+    for _ in range(28):
         changed = drifting(few, size, rng)
         bench = make_bench(changed, [changed], [recording], ())
         assert len(bench.fit) == 4

@@ -66,8 +66,8 @@ def test_a_load_that_changes_is_no_damage_where_bins_are_set():
 @pytest.mark.machines
 def test_false_alarms_of_a_changing_load_are_those_of_a_steady_one():
     alarms = sum(len(Loaded(seed, replace(LEARNING, state_bin=40.0)).run(400))
-                 for seed in range(5))
-    years = 5 * 400 * SECONDS / (365.25 * 86400.0)
+                 for seed in range(3))
+    years = 3 * 400 * SECONDS / (365.25 * 86400.0)
     assert alarms <= years + 4.0 * math.sqrt(years) + 1.0
 
 
