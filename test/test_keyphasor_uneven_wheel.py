@@ -132,6 +132,7 @@ def files(rng, tmp_path):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('unasked')
 def test_library_takes_the_target_of_the_machine_file(files):
     path, params = files
     found = sa.close_loop(path, params)

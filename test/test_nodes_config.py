@@ -158,6 +158,7 @@ def test_nodes_of_the_machine_file_find_the_truth_of_its_simulator(ros_graph):
 
 
 @pytest.mark.machines
+@pytest.mark.usefixtures('undrawn')
 def test_nodes_take_the_machine_file_of_a_wheel_with_an_extra_mark(ros_graph, tmp_path):
     path, declared = tmp_path / 'rig.npz', tmp_path / 'machine.yaml'
     write_rig(path, turns=100, edges=[*np.arange(12) / 12, 11.3 / 12], jitter=2e-5)

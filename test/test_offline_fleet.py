@@ -182,7 +182,7 @@ def test_cluster_without_a_worker_is_one_line(monkeypatch):
 
 
 @pytest.mark.machines
-@pytest.mark.usefixtures('undrawn')
+@pytest.mark.usefixtures('undrawn', 'unasked')
 def test_loops_of_a_folder_have_a_report_and_a_row_each(tmp_path, capfd):
     machine = Gearbox(mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6)), 5000.0, speed=((0.0, 25.0),),
                       seed=3, effects=(DeclaredJitter('normal', 8e-5), AdditiveNoise(0.02)))
