@@ -243,9 +243,8 @@ def test_jitter_of_a_declared_scale_is_that_and_normal_jitter_comes_on_top(scale
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('scale', [0.4, 0.7])
-def test_standard_error_of_a_scale_is_that_of_uniform_errors(scale):
-    off = []
+def test_standard_error_of_a_scale_is_that_of_uniform_errors():
+    scale, off = 0.4, []
     for seed in range(30):
         timing = read_timing([machine([510, seed], scale=scale)],
                              names=frozenset({'jitter_scale'}))
@@ -515,12 +514,11 @@ def test_missing_pulses_have_no_error():
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('lost', [2, 6])
-def test_skew_beside_missing_pulses_is_no_jitter(lost):
+def test_skew_beside_missing_pulses_is_no_jitter():
     """A missing pulse has the mean error, as it has in what a skew makes."""
     part = machine(12, skew=3e-4)
     measured = np.ones(part.errors.size, np.bool_)
-    measured[np.linspace(20, 280, lost).astype(int)] = False
+    measured[np.linspace(20, 280, 6).astype(int)] = False
     timing = read_timing([replace(part, measured=measured)])
     assert names_of(timing) == {'clock_skew'}
     value, error = value_of(timing, 'clock_skew', 'skew')
