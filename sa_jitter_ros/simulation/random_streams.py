@@ -21,7 +21,6 @@ import zlib
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import ParameterError
-from scipy.signal import lfilter
 
 CHUNK = 1024
 _LINES = 48  # sinusoids of a random function
@@ -82,6 +81,8 @@ class RandomStream:
             return self.normal(start, stop)
         memory = int(np.ceil(np.log(_NEGLIGIBLE) / np.log(abs(correlation))))
         gain = np.sqrt(1.0 - correlation**2)
+        from scipy.signal import lfilter  # which loads long, for streams without memory
+
         return in_chunks(lambda chunk: lfilter(
             [gain], [1.0, -correlation],
             self.normal(chunk * CHUNK - memory, (chunk + 1) * CHUNK))[:, memory:], start, stop)
