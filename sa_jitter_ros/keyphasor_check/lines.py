@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import FULL_BAND, interpolate
-from scipy.interpolate import PchipInterpolator
 from scipy.fft import next_fast_len, rfft
+from scipy.interpolate import PchipInterpolator
 from scipy.special import softmax
 
 _MOST_VALUES = 3_000_000
