@@ -301,11 +301,10 @@ class ShaftAverager:
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_wave_mean()
         # The mean of the samples leaks into orders without whole cycles in a trigger cycle. Order
-        # 0 and, as one more channel, a signal of 1 tell how much, where an average is long enough.
-        cycles = settings.cycle_length * np.array(settings.orders)
-        self._leaking = (abs(cycles - np.rint(cycles)) > _WHOLE) & (
-            cycles * settings.trigger_cycles >= _SEPARATE)
-        self._orders = (*settings.orders, 0.0) if self._leaking.any() else settings.orders
+        # 0 and, as one more channel, a signal of 1 tell how much.
+        self._turns = settings.cycle_length * np.array(settings.orders)
+        leaking = np.abs(self._turns - np.rint(self._turns)) > _WHOLE
+        self._orders = (*settings.orders, 0.0) if leaking.any() else settings.orders
         # Of the latest N_t cycles: amplitudes, and what the interpolator left of them before.
         self._amplitudes = Rows(np.empty(0))
         self._gains = Rows(np.empty((0, len(settings.orders))))
@@ -388,7 +387,6 @@ class ShaftAverager:
             return amplitudes
         one = amplitudes_of_one(self.settings.cycle_length, self._orders, self._cycle,
                                 len(amplitudes), points)
-        one[:, :-1] *= self._leaking
         return np.concatenate((amplitudes, one[:, None]), axis=1)
 
     def _without_constant(self, amplitudes: ComplexArray) -> ComplexArray:
@@ -396,13 +394,14 @@ class ShaftAverager:
         Return amplitudes (..., channel, order) without what the mean of the samples adds.
 
         The mean is weighted by a Hann window, so that orders with other than whole cycles in the
-        average do not leak into it.
+        average do not leak into it, unless they have few.
         """
         if len(self._orders) == len(self.settings.orders):
             return amplitudes
         means = self._amplitudes.items[:, :-1, -1].real / 2.0
         mean = np.average(means, axis=0, weights=np.hanning(len(means) + 2)[1:-1])
-        return np.asarray(amplitudes[..., :-1, :-1] - mean[:, None] * amplitudes[..., -1:, :-1])
+        one = np.where(self._turns * len(means) < _SEPARATE, 0.0, amplitudes[..., -1:, :-1])
+        return np.asarray(amplitudes[..., :-1, :-1] - mean[:, None] * one)
 
     def _new_mean(self, cycles: float) -> RunningMean:
         if self.settings.averaging == 'exponential':
