@@ -486,16 +486,15 @@ class ShaftAverager:
         pulses, used, seconds = self._edges()
         cycles, gains = self._without_constant(self._amplitudes.items), self._gains.items
         cycles.flags.writeable = False
+        noise, scatter = self._estimated_noise(cycles)
         numbers, speed = self._places.items['number'], len(cycles) / seconds
         refused = refused_orders(settings.orders, gains, method=settings.interpolation,
                                  rate=self._rate, speed=settings.cycle_length * speed)
         gain = mean_gain(gains, settings.orders, refused)
-        amplitudes = self._without_constant(
-            self._amplitude_mean.mean.view(np.complex128))
+        amplitudes = self._without_constant(self._amplitude_mean.mean.view(np.complex128))
         if refused:
             cycles, amplitudes = (np.where(np.isnan(gain), np.nan, item)
                                   for item in (cycles, amplitudes))
-        noise, scatter = self._estimated_noise()
         error = waveform_error(waveform, error, count, scatter.jitter, settings.cycle_length)
         average = Average(
             start_time=float(pulses[0]), end_time=float(pulses[-1]), sequence=self._sequence,
@@ -522,11 +521,15 @@ class ShaftAverager:
         gaps = float(np.sum(begins[breaks + 1] - ends[breaks]))
         return pulses, used, float(pulses[-1] - pulses[0]) - gaps
 
-    def _estimated_noise(self) -> tuple[FloatArray, Repeatability]:
-        """Return noise and repeatability; a sliding window renews them after an eighth of it."""
+    def _estimated_noise(self, cycles: ComplexArray) -> tuple[FloatArray, Repeatability]:
+        """
+        Return noise and repeatability of what the interpolator left of the `cycles`.
+
+        A sliding window renews them after an eighth of it.
+        """
         if self._noise is None or self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
-            cycles = self._without_constant(self._amplitudes.items) * self._gains.items[:, None]
+            cycles = cycles * self._gains.items[:, None]
             clean = without_leakage(cycles, orders, cycle_length,
                                     cycle_length * self._places.items['number'])
             self._noise = radial_noise(clean), Repeatability.of(

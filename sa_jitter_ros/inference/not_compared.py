@@ -112,8 +112,8 @@ def unresolved(observation: Observation) -> str:
     """Return that and why the vibration does not show the pulse errors."""
     known = observation.stacked('standard_errors')
     known = known[np.isfinite(known)]
-    recovered = [fit.held for recovery in observation.recoveries for fit in recovery.fits]
-    if known.size and (any(recovered) or not observation.recoveries):
+    recoveries = observation.recoveries
+    if known.size and (not recoveries or any(item.held for item in recoveries)):
         size = float(np.sqrt(np.mean(known**2)))
         return _no_line(f'the vibration shows an error of a single pulse to {size:.2g} s only; '
                         'smaller errors could not have been seen')

@@ -449,7 +449,7 @@ def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: Re
     """
     size = max(float(np.sqrt(model.distribution.variance)), recovery.size)
     typical = float(np.sqrt(np.mean(standard_errors**2)))
-    if not (np.isfinite(typical) and any(fit.held for fit in recovery.fits)):
+    if not (np.isfinite(typical) and recovery.held):
         return 'the vibration holds no declared order'
     loss = 0.5 * (math.tau * max(model.orders) * model.fundamental_frequency * typical) ** 2
     if typical >= RESOLVED * size and not bends and loss > _HARMLESS:

@@ -95,6 +95,11 @@ class RecordRecovery:
         return max(self.jitter_std, float(np.sqrt(max(power, 0.0))))
 
     @property
+    def held(self) -> bool:
+        """Tell whether declared lines of any stretch hold the angle to the pulses."""
+        return any(fit.held for fit in self.fits)
+
+    @property
     def resolved(self) -> bool:
         """Tell whether the vibration shows the errors of single pulses, beside slow ones."""
         known = self.standard_errors[np.isfinite(self.standard_errors)]
@@ -142,8 +147,8 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, MARGIN / rate)
     wider = 1.0
     recovery = _joined(pulses, stretches, fits(known, wider))
-    held = any(fit.held for fit in recovery.fits)  # else nothing tells the angle of other orders
-    if held and not recovery.resolved and ends(_WIDER) != ends(wider):
+    # Without lines that hold the angle nothing tells that of other orders.
+    if recovery.held and not recovery.resolved and ends(_WIDER) != ends(wider):
         found = _joined(pulses, stretches, fits(known, _WIDER))
         if found.resolved:  # orders that shafts must have tell how long the cycles are
             orders, tones = found.undeclared
