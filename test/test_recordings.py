@@ -26,6 +26,7 @@ import pytest
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.recordings import ArraySource, read, Recording, write_npz
 from sa_jitter_ros.recordings import hdf5_format, limits, mat_format, npz_format
+from sa_jitter_ros.recordings.channel_map import find_channel
 from sa_jitter_ros.recordings.fields import fields_of
 import scipy.io
 import scipy.io.wavfile
@@ -555,6 +556,14 @@ def test_unknown_channel_names_those_there_are(tmp_path):
     scipy.io.wavfile.write(tmp_path / 'mono.wav', 8000, np.zeros(10, np.int16))
     with pytest.raises(RecordingError, match='name a channel of vibration'):
         read(tmp_path / 'mono.wav', tach_channel='0')
+
+
+def test_a_channel_is_found_without_its_unit_if_that_is_clear():
+    names = ['n [V]', 'n (1/min)', 'Drehzahl [V]', 'a']
+    assert [find_channel(names, name) for name in ('Drehzahl', 'n [V]', 'a')] == [2, 0, 3]
+    for unclear in ('n', 'Drehzah', 'b'):
+        with pytest.raises(RecordingError, match=r'choose from n \[V\], n \(1/min\)'):
+            find_channel(names, unclear)
 
 
 # --- csv ----------------------------------------------------------------------------------------

@@ -84,9 +84,20 @@ class ChannelMap:
 
 
 def find_channel(names: Sequence[str], entry: str) -> int:
-    """Return the number of the channel with the name `entry`, else with that number."""
+    """
+    Return the number of the channel with the name `entry`, else with that number.
+
+    A unit in brackets at the end of a name may be left out if one channel has the rest.
+
+    >>> find_channel(['Drehzahl [V]', 'ax (g)'], 'ax')
+    1
+    """
     if entry in names:
         return list(names).index(entry)
     if entry.isdecimal() and int(entry) < len(names):
         return int(entry)
+    found = [place for place, name in enumerate(names) if name.endswith((']', ')'))
+             and name[:max(map(name.rfind, '[('))].rstrip() == entry]
+    if len(found) == 1:
+        return found[0]
     raise RecordingError(f'no channel {entry!r}: choose from {", ".join(names)}')
