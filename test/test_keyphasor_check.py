@@ -322,6 +322,14 @@ def test_jitter_of_pulses_has_its_size_memory_and_errors(rng, memory):
     assert np.mean(np.abs(correlation) < 3.0) > 0.8
 
 
+@pytest.mark.parametrize(('marks', 'start'), [(1, 0.0), (4, 0.0), (1, 1.7e9)])
+def test_the_rounding_of_exact_pulse_times_is_no_jitter(rng, marks, start):
+    pulses, *_ = tach(rng, marks, jitter=0.0)
+    check = checked(np.full((1, 1), np.nan), start + pulses, start_time=start)
+    assert values(check, 'jitter_std', 'jitter_correlation') == (None, None)
+    assert 'jitter_memory' not in codes(check)
+
+
 def test_slow_jitter_is_that_of_the_vibration(rng):
     times = tach(rng, jitter=6e-5, memory=0.9)[0]
     check = checked(vibration(rng, noise=0.1), times)

@@ -25,10 +25,10 @@ from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.keyphasor_check.clock import find_clock, is_decimal
+from sa_jitter_ros.keyphasor_check.clock import find_clock, is_decimal, ROUNDING
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
 from sa_jitter_ros.keyphasor_check.declared_parts import contradictions, meshes_seen, orders_seen
-from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
+from sa_jitter_ros.keyphasor_check.jitter import Jitter, measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
     usual_marks)
@@ -348,7 +348,7 @@ class _Check:
 
         The latter tell a delay, which a steady speed does not.
         """
-        measured = measure_jitter(fitted.true, fitted.numbers)
+        measured = self._jitter_of(fitted)
         size = measured.std if measured else fitted.scatter
         expected = max(math.sqrt(12.0) * size, 1.0 / clock.rate if clock.rate else 0.0)
         turns = fitted.turns
@@ -365,9 +365,15 @@ class _Check:
                     keyphasor_rate=1.0 / expected, correct_jitter=correct)
         return found
 
+    def _jitter_of(self, fitted: FittedPulses) -> Jitter | None:
+        """Return the jitter that the pulses show beyond the rounding of their times."""
+        found = measure_jitter(fitted.true, fitted.numbers)
+        rounding = ROUNDING * np.spacing(self._largest)
+        return None if found is None or found.std <= rounding else found
+
     def _jitter(self, fitted: FittedPulses, averages: Sequence[Average], hidden: str
                 ) -> dict[str, Checked]:
-        alone = None if hidden else measure_jitter(fitted.true, fitted.numbers)
+        alone = None if hidden else self._jitter_of(fitted)
         recovered = recovered_jitter(averages)
         if alone is None and recovered is None:
             by = (f'the motion makes all of the scatter, {1e6 * fitted.scatter:.2g} us: a '

@@ -18,6 +18,8 @@ from sa_jitter_ros.pulses.clock_grid import find_grid
 _MOST = 4000
 _FEWEST = 12
 _DECIMALS = 1e6  # Hz; a power of ten from there on may be a decimal
+#: steps of a float64 by which a difference of pulse times may be off
+ROUNDING = 4.0
 
 
 def find_clock(times: FloatArray, *, largest: float = 0.0) -> Clock:
@@ -33,7 +35,7 @@ def find_clock(times: FloatArray, *, largest: float = 0.0) -> Clock:
     times = np.unique(times[:_MOST])
     if times.size < _FEWEST:
         return NO_CLOCK
-    rounding = 4.0 * float(np.spacing(max(np.max(np.abs(times)), largest)))
+    rounding = ROUNDING * float(np.spacing(max(np.max(np.abs(times)), largest)))
     grid = find_grid(times, rounding)
     if grid is not None and is_decimal(grid[0]):  # a coarser one may be behind it
         grid = find_grid(times, rounding, 2.0 / grid[0]) or grid
