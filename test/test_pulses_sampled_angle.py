@@ -410,6 +410,15 @@ def test_unusable_angles_are_refused_in_a_line(angle, options, error, message):
 
 
 @pytest.mark.parametrize('turn', [360.0, 1.0])
+def test_times_that_run_backwards_are_refused_and_early_stamps_are_not():
+    order = np.random.default_rng(1).permutation(TIME.size)
+    with pytest.raises(SignalError, match='the times run backwards: sort them'):
+        sa.pulses_from_angle(TIME[order], wrapped(TURNED, 'pi')[order])
+    early = TIME.copy()
+    early[500] -= 0.005
+    assert sa.pulses_from_angle(early, wrapped(TURNED, 'pi')).size == 73
+
+
 def test_an_angle_in_another_unit_has_any_number_of_marks(turn):
     time = np.arange(4000) / 1e3
     angle = (9.3 * time + 0.3) % 1.0 * turn

@@ -46,6 +46,7 @@ _USUALLY = 0.9  # of the counts are within the range of a counter
 _GRAY = 0.6  # of the steps of Gray code, below which those of the counts behind it are
 _FASTEST = 1000.0  # turns a second of an angle in rad; more are doubtful
 _EXACT = 2.0 / np.finfo(np.float64).eps  # the largest count that is exact
+_EARLY = 0.01  # s, by which stamps may be early
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class AngleCrossings:
     1.0
     """
 
-    def __init__(self, *, marks: int = 1, time_tolerance: float = 0.01,
+    def __init__(self, *, marks: int = 1, time_tolerance: float = _EARLY,
                  runs: AngleRuns | None = None, counted: bool = False) -> None:
         if marks != int(marks) or marks < 1:
             raise ParameterError(f'marks {marks} must be a whole number, 1 or more')
@@ -411,7 +412,8 @@ def pulses_from_angle(times: ArrayLike, angle: ArrayLike, *, pulses_per_revoluti
     One of the marks is at angle 0. The shaft may turn in either direction. Samples where it cannot
     be are bridged, and a `DataWarning` says how many; a jump of the angle that is no wrap, lost
     samples and a reversal end a run. Samples that are not finite are left out. Raises
-    `ParameterError` for options and `SignalError` for arrays that cannot be used.
+    `ParameterError` for options and `SignalError` for arrays that cannot be used, as are times
+    that run backwards.
 
     A shaft at 25 Hz, sampled at 1 kHz; an absolute encoder of 12 bits on it; and an incremental
     one of 500 counts a turn:
@@ -432,7 +434,10 @@ def pulses_from_angle(times: ArrayLike, angle: ArrayLike, *, pulses_per_revoluti
     marks = number('pulses_per_revolution', pulses_per_revolution)
     if not (marks >= 1.0 and marks.is_integer()):
         raise ParameterError(f'pulses_per_revolution {marks:g} must be a whole number, 1 or more')
-    values = np.asarray(angle)
+    moments, values = np.asarray(times), np.asarray(angle)
+    if moments.dtype.kind in 'fiu' and np.any(np.diff(moments.astype(np.float64)) < -_EARLY):
+        raise SignalError('the times run backwards: sort them, and the angle with them '
+                          '(numpy.argsort), or split the recording')
     if values.ndim != 1 or values.dtype.kind not in 'fiu':
         raise SignalError(f'angle of shape {values.shape} and type {values.dtype}: give one row '
                           'of real numbers, in rad or counts')
@@ -472,7 +477,7 @@ def pulses_from_angle(times: ArrayLike, angle: ArrayLike, *, pulses_per_revoluti
              'bridged'] * bool(state.glitches)
     if turn == _TURN and not whole:
         found += _other_unit(finite, pulses, marks)
-    found += [f'{state.restarts} jumps of angle or time that are no wrap began a new run'] * bool(
+    found += [f'{state.restarts} jumps of the angle that are no wrap began a new run'] * bool(
         state.restarts)
     if found:
         warnings.warn(f'{"; ".join(found)}: check sensor and modulus', DataWarning, stacklevel=2)
