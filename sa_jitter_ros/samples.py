@@ -8,19 +8,28 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Blocks of consecutive samples, as recordings, messages and the averager exchange them."""
+"""
+Blocks of consecutive samples, as recordings, messages and the averager exchange them.
+
+Times, rates and samples beyond the limits do not occur on machines, and their squares, products
+and periods would overflow.
+"""
 
 from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from sa_jitter_ros.arrays import Array, FloatArray
+from sa_jitter_ros.errors import SaJitterError
 
+_MIN_RATE, _MAX_RATE = 1e-12, 1e12  # Hz
+_MAX_TIME = 1e15  # s, as 30 million years
+_MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 _RESOLUTION = 1e-3  # of a sample: to what times must be known
 _ABSOLUTE = 2.0**32  # s: the range of times since 1970, until 2106
 
 
-def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
+def finite_spans(samples: FloatArray) -> list[tuple[int, int]]:
     """
     Return first and end index of each span of `samples` (channel, sample) that a channel has.
 
@@ -54,6 +63,33 @@ def unresolved_times(time: float, sample_rate: float) -> str:
             'seconds since the start of the measurement')
 
 
+def check_rate(name: str, rate: float, error: type[SaJitterError]) -> None:
+    """Raise `error` for a rate (Hz) beyond the limits, and for NaN."""
+    if not _MIN_RATE <= rate <= _MAX_RATE:
+        raise error(f'{name} is {rate} Hz: must be from {_MIN_RATE:g} to {_MAX_RATE:g} Hz')
+
+
+def check_times(name: str, times: float | FloatArray, error: type[SaJitterError]) -> None:
+    """Raise `error` for finite times (s) beyond the limits."""
+    values = np.atleast_1d(times)
+    wrong = values[np.isfinite(values) & (np.abs(values) > _MAX_TIME)]
+    if wrong.size:
+        raise error(f'{name} is {wrong[0]} s: must be within {_MAX_TIME:g} s of 0; give seconds '
+                    'since the start of the measurement or since 1970')
+
+
+def check_samples(samples: Array, error: type[SaJitterError]) -> None:
+    """Raise `error` for finite samples beyond the limit; NaN and infinity are a gap."""
+    peak = max(float(samples.max(initial=0.0)), -float(samples.min(initial=0.0)))
+    if peak <= _MAX_SAMPLE:
+        return
+    finite = samples[np.isfinite(samples)]  # NaN has no order
+    largest = max(map(float, (finite.max(initial=0.0), finite.min(initial=0.0))), key=abs)
+    if abs(largest) > _MAX_SAMPLE:
+        raise error(f'sample of {largest}: must be within {_MAX_SAMPLE:g} of 0; check the '
+                    'unit and the scale')
+
+
 @dataclass(frozen=True)
 class SampleBlock:
     """
@@ -67,7 +103,7 @@ class SampleBlock:
     [(70, 5.0, [[0.0]]), (72, 5.02, [[2.0, 3.0]])]
     """
 
-    samples: NDArray[np.float64]
+    samples: FloatArray
     start_time: float
     sample_rate: float
     index: int

@@ -36,7 +36,7 @@ CORE = {
     'parameters': {'errors'},
     'parameter_file': {'errors', 'yaml'},
     'machine': {'errors', 'parameter_file', 'parameters'},
-    'samples': {'numpy'},
+    'samples': {'arrays', 'errors', 'numpy'},
     'version': set(),
     'whole_files': set(),
     'pulses': SCIENCE | {'errors', 'inner_loops', 'parameters', 'samples'},

@@ -441,3 +441,14 @@ def test_cycles_that_lack_pulses_from_the_start_are_counted(rng):
         sa.average(rng.normal(size=1000), 500.0, pulses, pulses_per_revolution=36)
     assert str(said[0].message).endswith(
         '16 missing pulses; no valid pulses to 0.801389 s: 16 trigger cycles discarded')
+
+
+@pytest.mark.parametrize('dtype', [np.int16, np.uint64, np.float16, np.float32, np.float64])
+def test_samples_of_any_type_are_taken_with_what_is_missing(dtype):
+    samples = np.arange(40_000).reshape(2, -1) % 50
+    samples = samples.astype(dtype)
+    if samples.dtype.kind == 'f':
+        samples[1, [7, 9]] = np.nan, np.inf
+    averager = sa.Averager(1000.0, trigger_cycles=5)
+    found = averager.update(samples, np.arange(0.0, 20.0, 0.05))
+    assert len(found) > 70

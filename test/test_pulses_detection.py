@@ -197,8 +197,10 @@ def test_time_running_back_starts_again():
     (np.array(0.0), 0.0, RATE, r'shape \(\)'),
     (np.zeros(5, complex), 0.0, RATE, 'complex128'),
     (np.zeros(5), np.nan, RATE, 'start time nan'),
-    (np.zeros(5), 0.0, np.inf, 'sample rate inf'),
-    (np.zeros(5), 0.0, 0.0, 'sample rate 0.0')])
+    (np.zeros(5), -1e16, RATE, 'start_time is -1e.16 s'),
+    (np.array([0.0, 1e150]), 0.0, RATE, 'sample of 1e.150: must be within 1e.100'),
+    (np.zeros(5), 0.0, np.inf, 'sample_rate is inf Hz'),
+    (np.zeros(5), 0.0, 0.0, 'sample_rate is 0.0 Hz')])
 def test_bad_waveforms_are_refused(samples, start, rate, message):
     with pytest.raises(SignalError, match=message):
         sa.detect_pulses(samples, rate, start_time=start)

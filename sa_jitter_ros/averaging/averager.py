@@ -37,7 +37,7 @@ from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.unit_check import is_waveform, likely_mistake, other_rate
-from sa_jitter_ros.samples import SampleBlock
+from sa_jitter_ros.samples import check_samples, SampleBlock
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -191,6 +191,7 @@ class Averager:
         if self._channels not in (None, len(samples)) and samples.size:
             raise SignalError(f'vibration has {len(samples)} channels and had {self._channels} '
                               'before: give (channel, sample) with the same channels')
+        check_samples(samples, SignalError)
         return samples
 
     def _taken(self, found: list[tuple[str, Average]]) -> tuple[Average, ...]:

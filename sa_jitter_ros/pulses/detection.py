@@ -30,8 +30,8 @@ from sa_jitter_ros.errors import DataWarning, SignalError
 from sa_jitter_ros.parameters import number, Values
 from sa_jitter_ros.pulses.detector_parameters import DETECTOR_PARAMETERS, OPTIONS
 from sa_jitter_ros.pulses.threshold import (
-    SchmittTrigger, state_levels, StateLevels, whole_pulses)
-from sa_jitter_ros.samples import SampleBlock
+    SchmittTrigger, state_levels, StateLevels, TOO_LONG, whole_pulses)
+from sa_jitter_ros.samples import check_rate, check_samples, check_times, SampleBlock
 
 Polarity = Literal['positive', 'negative', 'auto']
 Edge = Literal['rising', 'falling', 'centre']
@@ -413,6 +413,9 @@ def detect_pulses(
     elif (each := sample_rate * float(np.quantile(np.diff(pulses, prepend=-1e12), .25))) < _SPARSE:
         said.append(f'the keyphasor waveform has {each:.2g} samples a pulse, of which some may be '
                     f'lost: sample it at {_SPARSE * sample_rate / each:.0f} Hz or more')
+    check_rate('sample_rate', sample_rate, SignalError)
+    check_times('start_time', start_time, SignalError)
+    check_samples(block.samples, SignalError)
     for text in filter(None, said):
         warnings.warn(text, DataWarning, stacklevel=2)
     return pulses

@@ -27,6 +27,7 @@ from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.angle_runs import AngleRuns, BITS
+from sa_jitter_ros.samples import check_samples
 
 _TURN = 2.0 * math.pi
 _OTHER_TURNS, _SIMILAR = (360.0, 1.0), 0.1  # of an angle that is not in rad; part of them
@@ -45,8 +46,8 @@ _LEAST_MODULUS = 4.0  # counts; with fewer the direction cannot be told
 _USUALLY = 0.9  # of the counts are within the range of a counter
 _GRAY = 0.6  # of the steps of Gray code, below which those of the counts behind it are
 _FASTEST = 1000.0  # turns a second of an angle in rad; more are doubtful
-_EXACT = 2.0 / np.finfo(np.float64).eps  # the largest count that is exact
 _EARLY = 0.01  # s, by which stamps may be early
+_EXACT = 2.0 / np.finfo(np.float64).eps  # the largest count that is exact
 
 
 @dataclass(frozen=True)
@@ -441,6 +442,7 @@ def pulses_from_angle(times: ArrayLike, angle: ArrayLike, *, pulses_per_revoluti
     if values.ndim != 1 or values.dtype.kind not in 'fiu':
         raise SignalError(f'angle of shape {values.shape} and type {values.dtype}: give one row '
                           'of real numbers, in rad or counts')
+    check_samples(values, SignalError)
     finite = values[np.isfinite(values)].astype(np.float64)
     whole, turn = values.dtype.kind in 'iu', _TURN
     if not (whole or modulus or np.any(finite % 1.0)) and np.any(np.abs(finite) > _TURN):

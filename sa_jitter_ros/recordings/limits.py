@@ -9,10 +9,9 @@
 # the License.
 
 """
-Limits of input values, from messages or files, and of the unpacked size of files.
+Limits of the range of samples, and of the unpacked size of files.
 
-Times, rates and samples beyond the limits do not occur on machines, and their squares, products
-and periods would overflow. A file that unpacks to far more than its size is not a measurement.
+A file that unpacks to far more than its size is not a measurement.
 
 The unpacked size of a compressed bag is limited without unpacking it. Chunks of an MCAP file (its
 specification, "Records") and whole files may be compressed with zstd (RFC 8878, section 3.1.1).
@@ -25,14 +24,9 @@ from pathlib import Path
 import struct
 from typing import BinaryIO
 
-import numpy as np
-from sa_jitter_ros.arrays import FloatArray
-from sa_jitter_ros.errors import RecordingError, SaJitterError
+from sa_jitter_ros.errors import RecordingError
 
-MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
 MAX_VALUES = 200_000_000  # samples of all channels that are read into memory
-_MAX_TIME = 1e15  # s, as 30 million years
-_MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 #: A range of samples whose fourth powers are above 1e-308; a smaller one is none.
 LEAST_RANGE = 1e-75
 IN_MEMORY_BYTES = 64 << 20  # larger arrays of a file are mapped
@@ -41,32 +35,6 @@ _BLOCK = 1 << 17
 _MAGIC, _SKIPPABLE = 0xFD2FB528, 0x184D2A50
 _REPEATED, _COMPRESSED = 1, 2
 _FOOTER, _CHUNK, _CHUNK_INDEX = 0x02, 0x06, 0x08
-
-
-def check_rate(name: str, rate: float, error: type[SaJitterError]) -> None:
-    """Raise `error` for a rate (Hz) beyond the limits, and for NaN."""
-    if not MIN_RATE <= rate <= MAX_RATE:
-        raise error(f'{name} is {rate} Hz: must be from {MIN_RATE:g} to {MAX_RATE:g} Hz')
-
-
-def check_times(name: str, times: float | FloatArray, error: type[SaJitterError]) -> None:
-    """Raise `error` for finite times (s) beyond the limits."""
-    values = np.atleast_1d(times)
-    wrong = values[np.isfinite(values) & (np.abs(values) > _MAX_TIME)]
-    if wrong.size:
-        raise error(f'{name} is {wrong[0]} s: must be within {_MAX_TIME:g} s of 0; give seconds '
-                    'since the start of the measurement or since 1970')
-
-
-def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
-    """Raise `error` for finite samples beyond the limit; NaN and infinity are a gap."""
-    peak = max(float(samples.max(initial=0.0)), -float(samples.min(initial=0.0)))
-    if peak <= _MAX_SAMPLE:
-        return
-    wrong = samples[np.isfinite(samples) & (np.abs(samples) > _MAX_SAMPLE)]  # NaN has no order
-    if wrong.size:
-        raise error(f'sample of {wrong[0]}: must be within {_MAX_SAMPLE:g} of 0; check the '
-                    'unit and the scale')
 
 
 def check_size(name: str, size: int, limit: int, remedy: str = 'split the recording') -> None:

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.arrays import FloatArray
 from sa_jitter_ros.errors import MessageError, ParameterError
-from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
-from sa_jitter_ros.samples import SampleBlock
+from sa_jitter_ros.samples import check_rate, check_samples, check_times, SampleBlock
 
 FLOAT64 = 'std_msgs/Float64MultiArray'
 FLOAT32 = 'std_msgs/Float32MultiArray'

@@ -25,8 +25,8 @@ from sa_jitter_ros.arrays import Array, FloatArray
 from sa_jitter_ros.errors import quoted, RecordingError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
-from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
-from sa_jitter_ros.samples import SampleBlock, unresolved_times
+from sa_jitter_ros.samples import (
+    check_rate, check_samples, check_times, SampleBlock, unresolved_times)
 
 _MAX_CHANNELS = 4096
 _LONGEST = 500  # characters of an error that may quote a recording
