@@ -492,6 +492,19 @@ def test_spikes_in_every_window_cost_no_pulse(speed, every, length, rng):
     assert detector.state.spikes == length * places.size
 
 
+@pytest.mark.parametrize('length', [1, 3, 4, 6])
+def test_a_long_spike_is_the_same_in_any_cut(length):
+    wave = np.tile(np.repeat([0.0, 5.0], [80, 20]), 30)
+    wave[1910:1910 + length] = wave[3000 - length:] = 90.0
+    whole, one = detect(wave, rate=1000.0)
+    for cut in range(1909, 1911 + length):
+        for cuts in ([cut, 3000 - length + cut - 1909], range(cut, cut + 4)):
+            found, detector = detect(wave, rate=1000.0, cuts=cuts)
+            assert np.array_equal(found, whole)
+            assert detector.state == one.state
+    assert one.state.spikes == (2 * length if length < 4 else 0)
+
+
 def slow_shaft(speed, marks, rate, seconds, *, noise=0.01):
     """Return a waveform in V of bumps at `marks` of a revolution, and how many pass."""
     t = np.arange(round(seconds * rate)) / rate

@@ -141,7 +141,7 @@ class KeyphasorDetector:
         self._levels: StateLevels | None = None
         self._confirmed = False
         self._pending: StateLevels | None = None
-        self._bridge = np.nan  # the last sample that is no spike
+        self._latest, self._doubtful = _NONE, 0  # samples, the last ones of which may be a spike
         self._trigger = SchmittTrigger(interpolate=self._interpolate)
         self._trigger_origin = np.nan
         self._leading: float | None = None
@@ -193,7 +193,13 @@ class KeyphasorDetector:
         while size and self._levels is None:
             found = self._learn(size, whole=size < self._held)
             size = size // 2 if size > self._shortest else 0
+        self._end()
         return found
+
+    def _end(self) -> None:
+        """Take the last samples that may be a spike for one: none follow them."""
+        self._spikes += self._doubtful
+        self._latest, self._doubtful = _NONE, 0
 
     def _review(self, window: int) -> FloatArray:
         """Learn from the shortest window that holds whole pulses; each is twice as long."""
@@ -260,15 +266,20 @@ class KeyphasorDetector:
                 else self._sign * self._given_threshold)
 
     def _bridged(self, samples: FloatArray, levels: StateLevels) -> FloatArray:
-        """Return the samples with the last sound one in place of spikes, which are counted."""
-        spikes = levels.spikes(samples)
+        """
+        Return the samples with the last sound one in place of spikes, which are counted.
+
+        The last ones wait for the next if they may be a spike, or the begin of what is none.
+        """
+        every = np.concatenate((self._latest, samples))
+        spikes, begin = levels.spikes(every), self._latest.size - self._doubtful
+        end = every.size - int(np.argmin(np.append(spikes[::-1], False)))
+        self._latest, self._doubtful = every[max(end - TOO_LONG, 0):], every.size - end
         if spikes.any():
-            self._spikes += int(np.count_nonzero(spikes))
-            sound = np.maximum.accumulate(np.where(spikes, -1, np.arange(samples.size)))
-            before = levels.low if np.isnan(self._bridge) else self._bridge
-            samples = np.where(sound < 0, before, samples[sound])
-        self._bridge = float(samples[-1])
-        return samples
+            self._spikes += int(np.count_nonzero(spikes[begin:end]))
+            sound = np.maximum.accumulate(np.where(spikes, -1, np.arange(every.size)))
+            every = np.where(sound < 0, levels.low, every[sound])
+        return np.asarray(every[begin:end])
 
     def _detect(self, piece: Piece) -> FloatArray:
         """Return the times of the pulses that end their detection in `piece`."""
@@ -276,9 +287,10 @@ class KeyphasorDetector:
         if origin != self._trigger_origin:
             self._trigger = SchmittTrigger(interpolate=self._interpolate)
             self._trigger_origin, self._leading, self._last_pulse = origin, None, -np.inf
-            self._bridge = np.nan
+            self._end()
         levels = self._levels or StateLevels(0.0, 0.0, significant=False)
         if self._levels:
+            index -= self._doubtful
             samples = self._bridged(samples, levels)
         steep = levels.steep if self._given_threshold is None else ''
         crossings, rising = self._trigger.update(
@@ -398,11 +410,12 @@ def detect_pulses(
         raise SignalError(f'the keyphasor waveform has shape {samples.shape}: give one channel')
     if samples.dtype.kind not in 'fiub':
         raise SignalError(f'the keyphasor waveform has type {samples.dtype}: give real numbers')
-    if not 0.0 < sample_rate < np.inf:
-        raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
     if not np.isfinite(start_time):
         raise SignalError(f'start time {start_time} s must be finite')
     block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
+    check_rate('sample_rate', sample_rate, SignalError)
+    check_times('start_time', start_time, SignalError)
+    check_samples(block.samples, SignalError)
     pulses = pulses_in_blocks(detector, [block])
     state, said = detector.state, [spikes_text(detector.state.spikes)]
     if not pulses.size:
@@ -413,9 +426,6 @@ def detect_pulses(
     elif (each := sample_rate * float(np.quantile(np.diff(pulses, prepend=-1e12), .25))) < _SPARSE:
         said.append(f'the keyphasor waveform has {each:.2g} samples a pulse, of which some may be '
                     f'lost: sample it at {_SPARSE * sample_rate / each:.0f} Hz or more')
-    check_rate('sample_rate', sample_rate, SignalError)
-    check_times('start_time', start_time, SignalError)
-    check_samples(block.samples, SignalError)
     for text in filter(None, said):
         warnings.warn(text, DataWarning, stacklevel=2)
     return pulses

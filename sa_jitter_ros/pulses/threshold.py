@@ -41,6 +41,8 @@ _DEAD_BAND = 0.1
 # Spikes: the most in a window, or one for so many pulses; samples of one that is as wide as a
 # pulse may be; and how often they are looked for, each time in a smaller range.
 _FEW_SPIKES, _PULSES_EACH, _SHORT, _SIZES = 2, 10, 3, 8
+#: samples of what is too long for a spike
+TOO_LONG = _SHORT + 1
 # Levels between a moving resting level and the tops of the pulses: their least width in bins, and
 # the share of the samples that must be on either side.
 _GAP, _HELD = 10, 0.01
