@@ -492,6 +492,16 @@ def test_spikes_in_every_window_cost_no_pulse(speed, every, length, rng):
     assert detector.state.spikes == length * places.size
 
 
+@pytest.mark.parametrize(('speed', 'hum', 'noise'), [
+    (1.6, 0.2, 0.0), (2.0, 0.2, 0.0), (0.4, 0.0, 0.01), (1.0, 0.0, 0.05)])
+def test_hum_and_clipped_noise_between_slow_pulses_are_none(speed, hum, noise, rng):
+    t = np.arange(10_000) / 1e3
+    wave = ((speed * t + 0.95) % 1.0 < 0.3) + hum * np.sin(2.0 * np.pi * 50.3 * t)
+    clip = (0.0, 1.0) if noise else (-1.0, 2.0)
+    wave = np.clip(wave + noise * rng.standard_normal(t.size), *clip)
+    assert detect(wave, rate=1e3)[0].size == int(10.0 * speed + 0.95)
+
+
 @pytest.mark.parametrize('length', [1, 3, 4, 6])
 def test_a_long_spike_is_the_same_in_any_cut(length):
     wave = np.tile(np.repeat([0.0, 5.0], [80, 20]), 30)

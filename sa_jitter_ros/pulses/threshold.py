@@ -164,13 +164,14 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
     share = float(np.mean(kept > levels.middle))
     coarse = _in_last_bits(levels, kept)
     as_pulses = _changes_as_pulses(levels, kept, coarse=coarse)
-    if coarse and not as_pulses:
+    noise = _noise(kept)
+    if not as_pulses and (coarse or noise > _QUIET * levels.difference):
         return replace(levels, significant=False)
     near = _CLOSE * levels.difference
     at_levels = np.count_nonzero(kept < levels.low + near) + np.count_nonzero(
         kept > levels.high - near)
     pulsed = as_pulses and bool(levels.steep or at_levels > _AT_LEVELS * kept.size)
-    return replace(levels, share=share, pulsed=pulsed, noise=_noise(kept),
+    return replace(levels, share=share, pulsed=pulsed, noise=noise,
                    lowest=float(kept.min()), highest=float(kept.max()))
 
 
@@ -209,13 +210,14 @@ def _changes_as_pulses(levels: StateLevels, samples: FloatArray, *, coarse: bool
     """
     Return whether samples pass from level to level as pulses do, and not as noise.
 
-    Rare single samples stand as far above white noise as pulses do, but alone.
+    Rare single samples stand as far above white noise as pulses do, but alone; and no noise has a
+    run in more than four samples, as a fast encoder has.
     """
     above = samples > (0.5 * (levels.middle + levels.high) if levels.steep else levels.middle)
     begin, end = _runs(above if 2 * np.count_nonzero(above) < above.size else ~above)
     # Of few intervals those of noise are even by chance.
     chance = 0.5 * coarse * math.sqrt(_INTERVALS / max(begin.size, 1))
-    if _regular(begin, _EVEN * (1.0 - chance)):
+    if _regular(begin, _EVEN * (1.0 - chance)) or (not coarse and 4 * begin.size > samples.size):
         return True
     return bool(np.mean(end - begin) > _LONG)
 
@@ -325,10 +327,10 @@ def _passed_by_all(samples: FloatArray) -> StateLevels | None:
     # Pulses without a flat top are crossed equally often up to their tips.
     most = np.searchsorted(below, np.array([_HELD, 1.0 - _HELD]) * samples.size)
     begin, end = np.maximum(ends[:-1], most[0]), np.minimum(ends[1:], most[1]) - 1
-    held = np.flatnonzero((crossed[begin] > 1) & (end - begin >= _GAP))
-    if not held.size:
+    held = np.flatnonzero((crossed[begin] > 0) & (end - begin >= _GAP))
+    widest = max(held, key=lambda k: ((end[k] - begin[k]) // _GAP, -crossed[begin[k]]), default=0)
+    if not held.size or crossed[begin[widest]] == 1:  # a part of a pulse, with hum on it
         return None
-    widest = max(held, key=lambda k: ((end[k] - begin[k]) // _GAP, -crossed[begin[k]]))
     edges = low + (np.array([begin[widest], end[widest]]) + 1) * (high - low) / _BINS
     passed = StateLevels(float(edges[0]), float(edges[1]), significant=True)
     return passed if _contrast(samples, samples > passed.middle) > 2.0 * _CONTRAST else None
