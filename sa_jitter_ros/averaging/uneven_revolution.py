@@ -43,7 +43,8 @@ def lost_inside_revolutions(pulses: FloatArray, settings: AverageSettings,
     part = (turns - turns[:, :1]) / period[:, None]
     pitch = np.diff(np.median(part[steady], axis=0), append=1.0)
     nominal = np.ones(marks) / pulses_per_revolution
-    nominal[np.argmax(pitch)] *= 1.0 + missing_teeth
+    for _ in range(missing_teeth):
+        nominal[np.argmax(pitch / nominal)] += 1.0 / pulses_per_revolution
     off = np.cumsum(pitch - nominal)
     error = _MEDIAN_ERROR * np.std(part[steady], axis=0) / np.sqrt(np.count_nonzero(steady))
     if off @ off < _CLEAR * (error @ error):  # jitter leaves as much
