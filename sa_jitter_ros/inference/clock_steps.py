@@ -125,7 +125,8 @@ class _Phasors:
         for first in range(0, times.size - 1, _CHUNK):
             cycles = reader.amplitudes(
                 reader.cycles(times[first:first + _CHUNK + 1]), model, orders)
-            rows.append(cycles * np.exp(-2j * np.pi * model.cycle_length * first * orders))
+            turned = np.exp(-2j * np.pi * model.cycle_length * first * orders)
+            rows.append(np.nan_to_num(cycles) * turned)  # without those that a short cycle refuses
         phasors = np.concatenate(rows)
         noise = np.mean(np.abs(np.diff(phasors, axis=0)) ** 2, axis=0) if len(phasors) > 1 else 1.0
         scaled = phasors / np.sqrt(np.maximum(noise, np.finfo(float).tiny))

@@ -60,7 +60,7 @@ def choose_lines(observation: Observation) -> Lines:
     with np.errstate(divide='ignore', invalid='ignore'):
         coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
             np.abs(cycles) ** 2, axis=(0, 1))
-    good = (level >= STRONG * np.nanmax(level, axis=0)) & (
+    good = (level >= STRONG * np.nan_to_num(level).max(axis=0)) & (
         coherence > CHANCE / cycles.shape[1])
     if good.any():
         good &= coherence >= _COHERENT * coherence[good].max()
