@@ -336,3 +336,17 @@ def test_given_angles_are_found_in_far_fewer_revolutions_than_unknown_ones_are_l
             corrector.extend(times[3 * turn - 2:3 * turn + 1].tolist(), [1] * 3)
         waited.append(turn)
     assert waited[0] < 0.2 * waited[1]
+
+
+@pytest.mark.parametrize('missing', [0, 1])
+def test_given_angles_of_a_wheel_with_an_index_need_no_revolutions(missing):
+    """Such as one at 0.5 Hz, of which the seconds that pulses wait show one and a half."""
+    place = np.sort([*range(12), 0.5]) / 12.0 if not missing else np.arange(7) / 8.0 + 2e-3 * (
+        np.arange(7) % 3)
+    late = 2.0 * np.pi * (place - np.arange(place.size) / (place.size + missing))
+    validator = PulseValidator(
+        pulses_per_revolution=place.size + missing, missing_teeth=missing, pulses_per_trigger=1,
+        target_geometry='given', target_angles=(late - late.mean()).tolist())
+    found = validator.update((np.arange(20)[:, None] + place).ravel() / 0.5).times
+    assert (validator.take_messages(), validator.counts.geometry_refused) == ([], 0)
+    assert np.diff(found) == pytest.approx(2.0 / (place.size + missing), abs=1e-6)

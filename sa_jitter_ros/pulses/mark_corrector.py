@@ -36,7 +36,8 @@ class MarkCorrector:
     """
     Subtracts from pulses how late their marks are: learnt, or `given` (mark,) in rad.
 
-    It takes what `TriggerCounter` takes and gives it to that. A revolution has `count` teeth.
+    It takes what `TriggerCounter` takes and gives it to that. A revolution has `count` teeth. If
+    they have an `index`, it tells which mark is which where revolutions are too few to show it.
     `geometry` is what is subtracted now, None for nothing, of the `teeth` (mark,) that are there;
     what went wrong it tells `say`.
 
@@ -52,9 +53,9 @@ class MarkCorrector:
     (True, array([ 0.02,  0.  , -0.02]))
     """
 
-    def __init__(self, counter: TriggerCounter, *, count: int,
-                 given: FloatArray | None = None, say: Callable[[str], None]) -> None:
-        self._counter, self._count, self._say = counter, count, say
+    def __init__(self, counter: TriggerCounter, *, count: int, given: FloatArray | None = None,
+                 index: bool = False, say: Callable[[str], None]) -> None:
+        self._counter, self._count, self._index, self._say = counter, count, index, say
         self._learns = given is None
         self._known: MarkOffsets | None = None  # the latest that was not refused
         if given is not None:
@@ -170,13 +171,15 @@ class MarkCorrector:
         """Find the angles that the pulses show; `last`: they cannot wait for more."""
         times, numbers = (np.concatenate(each) for each in zip(*self._seen))
         teeth = np.unique(numbers % self._count)
-        even = teeth.size == self._count
         found = measured_geometry(times, numbers, teeth, self._count)
         reason = f'{(numbers[-1] - numbers[0]) / self._count:.3g} revolutions are too few'
         if self._waits and self._known is not None:
+            turn = 0
             if found is not None:
                 turn, reason = turned_by(self._known, found,
-                                         np.arange(teeth.size) if even else np.zeros(1, int))
+                                         np.arange(1 if self._index else teeth.size))
+            elif last and self._index and teeth.size == self._known.angles.size:
+                reason = ''
             if not reason:
                 self._shift = turn
                 self._use(self._known, teeth)

@@ -134,7 +134,8 @@ class PulseValidator:
         self._corrector: MarkCorrector | None = None
         if target_geometry != 'none' and target.marks > 1:
             self._sink = self._corrector = MarkCorrector(
-                self._counter, count=teeth, given=given if given.size else None, say=verdicts.say)
+                self._counter, count=teeth, given=given if given.size else None,
+                index=isinstance(target, ToothedWheel), say=verdicts.say)
         self._judge = PulseJudge(target, self._sink, JudgeOptions(
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
