@@ -449,6 +449,16 @@ def test_positions_in_gray_code_are_refused_with_the_remedy(rate, bits):
     assert sa.pulses_from_angle(time, coded, modulus=2**bits).size == 29
 
 
+@pytest.mark.parametrize('bits', [16, 32])
+def test_a_glitch_and_an_overflow_are_no_gray_code(bits):
+    counts = np.floor(50.0 - 100.0 * TURNED).astype(np.int64) % 2**bits
+    counts[5000] = 5 * 2**(bits - 3)
+    with pytest.warns(DataWarning, match='^1 samples of the angle are where the shaft cannot be'):
+        assert sa.pulses_from_angle(TIME, counts, pulses_per_revolution=100).size == pytest.approx(
+            7300, abs=1)
+
+
+
 @pytest.mark.parametrize('rate', [100.0, 1e3, 10e3])
 def test_an_angle_in_degrees_that_was_unwrapped_is_doubted(rate):
     time = np.arange(int(4.0 * rate)) / rate
