@@ -21,7 +21,7 @@ RATE, SPEED, SECONDS = 5000.0, 10.0, 5.0
 
 
 def machine(ripple, times, phase, teeth, missing, orders, phases):
-    """Return vibration (sample,) of a shaft whose speed ripples, and pulses of teeth not missing."""
+    """Return vibration (sample,) of a shaft whose speed ripples, and pulses of its target."""
     time = np.arange(int(RATE * SECONDS)) / RATE
     turns = SPEED * time + ripple / times / (2.0 * np.pi) * np.sin(
         times * 2.0 * np.pi * SPEED * time + phase)

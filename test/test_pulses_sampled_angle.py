@@ -458,7 +458,6 @@ def test_a_glitch_and_an_overflow_are_no_gray_code(bits):
             7300, abs=1)
 
 
-
 @pytest.mark.parametrize('rate', [100.0, 1e3, 10e3])
 def test_an_angle_in_degrees_that_was_unwrapped_is_doubted(rate):
     time = np.arange(int(4.0 * rate)) / rate

@@ -174,12 +174,11 @@ class MarkCorrector:
         found = measured_geometry(times, numbers, teeth, self._count)
         reason = f'{(numbers[-1] - numbers[0]) / self._count:.3g} revolutions are too few'
         if self._waits and self._known is not None:
-            turn = 0
             if found is not None:
                 turn, reason = turned_by(self._known, found,
                                          np.arange(1 if self._index else teeth.size))
             elif last and self._index and teeth.size == self._known.angles.size:
-                reason = ''
+                turn, reason = 0, ''
             if not reason:
                 self._shift = turn
                 self._use(self._known, teeth)
