@@ -53,16 +53,16 @@ def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn
 
 
 def test_an_order_that_short_cycles_refuse_is_compared_nowhere(recwarn):
-    """Twelve marks and an extra one half way, so that two trigger cycles are half as long."""
-    time, place = np.arange(4000) / 100.0, np.sort([*range(12), 0.5]) / 12.0
-    late = 2.0 * np.pi * (place - np.arange(13) / 13.0)
-    pulses = (np.arange(39)[:, None] + place).ravel() + 0.01
+    """The speed swings by a quarter: the fastest cycles have fewer than two samples a turn."""
+    time = np.arange(1600) / 100.0
+    turns = time + 0.25 / np.pi * np.sin(np.pi * time)
+    pulses = np.interp(np.arange(1, 13 * 15) / 13.0, turns, time)
     model = DeclaredModel(keyphasor_rate=1e4, trigger_speed=1.0, trigger_cycles=26,
-                          orders=(28.0, 29.0), sample_rate=100.0, pulses_per_revolution=13,
+                          orders=(45.0, 46.0), sample_rate=100.0, pulses_per_revolution=13,
                           pulses_per_trigger=1)
     observation = observe(Recording(
-        ArraySource(np.cos(2.0 * np.pi * 28.0 * time)[None]), 100.0, pulse_times=pulses,
-        pulses_per_revolution=13, target_angles=tuple(late - late.mean())), model)
+        ArraySource(np.cos(2.0 * np.pi * 45.0 * turns)[None]), 100.0, pulse_times=pulses,
+        pulses_per_revolution=13), model)
     assert not choose_lines(observation).order.size
     assert not [item for item in recwarn if item.category is RuntimeWarning]
 
