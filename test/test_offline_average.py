@@ -23,6 +23,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS
 from sa_jitter_ros.commands import average, check_keyphasor
+from sa_jitter_ros.offline import fleet
 from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.npz_format import write_npz
@@ -272,6 +273,7 @@ def test_figures_of_a_run_up_with_gear(tmp_path):
 ])
 def test_unusable_input_is_one_line_and_status_2(
         rig, tmp_path, capsys, monkeypatch, arguments, says):
+    monkeypatch.setattr(fleet, 'ANSWER', 1.0)
     monkeypatch.chdir(tmp_path)
     Path('empty').mkdir()
     assert run(*arguments, '--output', 'out') == 2
