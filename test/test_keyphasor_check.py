@@ -577,7 +577,8 @@ def test_jitter_that_the_pulses_hide_is_told_in_us(rng, monkeypatch):
     monkeypatch.setattr(check_module, 'recovered_jitter', lambda _: Jitter(3e-5, 1e-6, 0.9, 0.02))
     numbers = np.arange(2000)
     fitted = SimpleNamespace(true=numbers / 25.0 + rng.normal(0.0, 1e-5, 2000), numbers=numbers)
-    found = check_module._Check._jitter(None, fitted, (), '')['jitter_std']
+    check = SimpleNamespace(_jitter_of=lambda item: measure_jitter(item.true, item.numbers))
+    found = check_module._Check._jitter(check, fitted, (), '')['jitter_std']
     assert found.value == 3e-5
     alone = found.decided_by.split('the pulses alone show ')[1].split(' us')[0]
     assert float(alone) == pytest.approx(10.0, rel=0.1)
