@@ -430,6 +430,33 @@ def far(times, bad, reach):
     return times[np.minimum(times - bad[after - 1], bad[after] - times) > reach]
 
 
+def test_hum_between_slow_pulses_is_none():
+    """Of 2 to 9 % of the pulse, which single windows hold alone."""
+    wrong, trials = 0, 100
+    for seed in range(trials):
+        rng = np.random.default_rng(seed)
+        speed, rate = 10.0 ** rng.uniform(-0.6, 0.3), rng.choice([1e3, 5e3])
+        t = np.arange(round(6.0 / speed * rate)) / rate
+        turns = speed * t + rng.uniform()
+        wave = (turns % 1.0 < rng.uniform(0.05, 0.9)) + rng.uniform(0.01, 0.045) * np.sin(
+            2.0 * np.pi * rng.choice([50.0, 60.0, 100.0]) * t) + rng.choice(
+                [0.001, 0.01]) * rng.standard_normal(t.size)
+        found = detect(wave, rate=rate, cuts=rng.integers(t.size, size=9))[0]
+        wrong += found.size != np.floor(turns[-1]) - np.floor(turns[0])
+    # a few times noise and hum rest at two levels by chance
+    assert wrong <= 0.03 * trials
+
+
+def test_a_sine_waits_for_its_levels_and_loses_nothing():
+    t = np.arange(round(12.0 * RATE)) / RATE
+    detector = KeyphasorDetector()
+    found = [detector.update(block, 0.5 * k, RATE) for k, block in enumerate(
+        np.split(np.sin(2.0 * np.pi * 20.0 * t + 1.0), 24))]
+    assert [item.size for item in found[:7]] == [0] * 7
+    assert found[7].size == pytest.approx(80, abs=1)
+    assert np.allclose(np.diff(np.concatenate(found)), 0.05)
+
+
 @pytest.mark.machines
 def test_spoilt_samples_cost_only_the_pulses_near_them():
     """Whatever their number, place and size: all but those within 1 s or 10 turns are the same."""

@@ -38,13 +38,14 @@ Edge = Literal['rising', 'falling', 'centre']
 _NONE: FloatArray = np.empty(0)
 Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first sample, samples
 # Fraction of the level difference. After two windows with levels that agree, a smaller difference
-# is the noise of a stopped machine.
-_STOPPED = 0.1
+# is the noise of a stopped machine, or hum between slow pulses.
+_STOPPED = 0.2
 # Fraction of the level difference by which the levels of the same signal may have drifted.
 _DRIFTED = 0.5
 # Half of the hysteresis: at least so many standard deviations of the noise, by which a slow edge
 # crosses the threshold several times, but at most this fraction of the level difference.
 _BEYOND_NOISE, _WIDEST = 4.0, 0.2
+_SLOW = 8  # windows after which a signal that does not rest at its levels is no hum
 _FEWEST = 40  # samples from which levels are learnt: ten intervals of four
 # The longest window, s and samples: two pulses of a shaft at 0.05 Hz, or 32 MB.
 _LONGEST, _MOST = 64.0, 1 << 22
@@ -83,14 +84,15 @@ class KeyphasorDetector:
 
     The detector learns the two state levels from the first window that holds whole pulses, and
     updates them from each later one. Windows have `learning_time` seconds or, for slow shafts,
-    twice as many, and twice again, up to a minute. Samples wait until then, so that no pulse is
-    lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels that two windows have
-    agreed on change only where the next two agree on others, so that no single event, whatever its
-    size, moves them for longer. Up to three samples that are farther from all others than these
-    are apart are a spike, and are bridged. If no `threshold` is given, pulses with a lobe on
-    either side of the resting level, as a variable reluctance sensor makes them, have the time of
-    the steep crossing between the lobes. The time of a slow edge in noise is that of the straight
-    line through its samples.
+    twice as many, and twice again, up to a minute; a waveform that does not rest at its first
+    levels may be hum before a slow pulse, and needs 8 windows. Samples wait until then, so that no
+    pulse is lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels that two windows
+    have agreed on change only where the next two agree on others, so that no single event,
+    whatever its size, moves them for longer. Up to three samples that are farther from all others
+    than these are apart are a spike, and are bridged. If no `threshold` is given, pulses with a
+    lobe on either side of the resting level, as a variable reluctance sensor makes them, have the
+    time of the steep crossing between the lobes. The time of a slow edge in noise is that of the
+    straight line through its samples.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
     :param hysteresis: width of the band around the threshold, a fraction of the level difference;
@@ -139,7 +141,7 @@ class KeyphasorDetector:
         self._window: list[Piece] = []
         self._held = self._shortest = 0  # samples in the window, and in one of `learning_time`
         self._levels: StateLevels | None = None
-        self._confirmed = False
+        self._confirmed, self._learnt = False, 0  # samples of the window they are from
         self._pending: StateLevels | None = None
         self._latest, self._doubtful = _NONE, 0  # samples, the last ones of which may be a spike
         self._trigger = SchmittTrigger(interpolate=self._interpolate)
@@ -153,10 +155,10 @@ class KeyphasorDetector:
         """Return the state levels and the counts so far."""
         levels = self._levels or StateLevels(np.nan, np.nan, significant=False)
         low, high = sorted((self._sign * levels.low, self._sign * levels.high))
-        waiting = 0 if self._levels else self._held
         return KeyphasorState(
             low=low, high=high, threshold=self._sign * self._threshold(levels),
-            waiting=waiting, too_close=self._too_close, spikes=self._spikes,
+            waiting=0 if self._levels else self._held,
+            too_close=self._too_close, spikes=self._spikes,
             polarity='auto' if not self._decided else (
                 'positive' if self._sign > 0.0 else 'negative'))
 
@@ -222,16 +224,19 @@ class KeyphasorDetector:
         if known and not levels.significant:  # larger pulses, perhaps
             levels = state_levels(window, known)
         useful = levels.significant and levels.difference > self._minimum_difference
-        stopped = known and self._confirmed and not levels.pulsed and (
+        slow = self._shortest < self._learnt >= size  # they are of pulses longer than this
+        stopped = known and self._confirmed and (slow or not levels.pulsed) and (
             levels.difference < _STOPPED * known.difference)
-        if stopped or not useful or (whole and not whole_pulses(window, levels)):
+        hum = not known and not levels.pulsed and size < _SLOW * self._shortest
+        if stopped or not useful or (whole and (hum or not whole_pulses(window, levels))):
             return _NONE
         waiting, self._window, self._held = self._window, [], 0
         if known is None:
             if not self._decided:
                 waiting, levels = self._decide(waiting, levels)
-            self._levels = levels
+            self._levels, self._learnt, self._confirmed = levels, size, size > self._shortest
             return np.concatenate([self._detect(piece) for piece in waiting])
+        above = window >= self._threshold(known)
         if levels.resembles(known, _DRIFTED):
             self._pending, self._confirmed = None, True
             if not levels.resembles(known):
@@ -240,17 +245,13 @@ class KeyphasorDetector:
                 self._levels = replace(levels, resting=known.resting)
             elif max(levels.noise, known.noise) > _LOUDER * min(levels.noise, known.noise):
                 self._levels = replace(known, noise=levels.noise)
-        elif not self._confirmed or self._idle(window, known) or (
+        elif not self._confirmed or above.all() or not above.any() or (
                 self._pending and levels.resembles(self._pending, _DRIFTED)):
-            self._levels, self._pending, self._confirmed = levels, None, False
+            self._levels, self._learnt, self._pending = levels, size, None
+            self._confirmed = False
         else:
             self._pending = levels
         return _NONE
-
-    def _idle(self, window: FloatArray, known: StateLevels) -> bool:
-        """Return whether the known levels find nothing in a window that has others."""
-        threshold = self._threshold(known)
-        return bool(np.all(window < threshold) or np.all(window >= threshold))
 
     def _decide(self, waiting: list[Piece], levels: StateLevels
                 ) -> tuple[list[Piece], StateLevels]:

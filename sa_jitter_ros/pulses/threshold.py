@@ -52,8 +52,9 @@ _CENTRAL = 0.25  # part of them, by which the middle of the modes may be beside 
 # widths of a lobe, beyond which they are pulses of their own.
 _LOBES, _RESTS, _NEAR, _LOBE, _JOINED = 0.25, 0.4, 0.15, 0.5, 2.0
 _GAPS = 2.0  # the pause where teeth are missing over others, and that between lobes of one
-# A waveform that is so often near one of its levels is no hum: a sine is in 41 % of its samples.
-_AT_LEVELS, _CLOSE = 0.6, 0.1
+# A waveform that is so seldom half way between its levels is no hum: of the samples of a sine 26 %
+# are in the middle two fifths.
+_HALF_WAY, _CLOSE = 0.1, 0.1
 # Mean length of the runs of samples in the rarer state that noise may have; and levels that are so
 # few steps of the samples apart may be a converter's last bit.
 _LONG, _STEPS = 2.5, 2.5
@@ -74,9 +75,9 @@ class StateLevels:
     `significant` is True where samples change between two levels, False for a constant or white
     noise. Pulses with lobes on both sides of a `resting` level (else NaN) cross it between the
     lobes, the `steep` way: 'rising' or 'falling', '' for pulses with one lobe. `share` is that of
-    the samples above the middle, `pulsed` tells that most samples are near one of the levels, and
-    that they change as pulses do, `noise` is the standard deviation of white noise whose second
-    differences are as large. All samples that are no spikes are from `lowest` to `highest`.
+    the samples above the middle, `pulsed` tells that few of them are half way between the levels,
+    and that they change as pulses do, `noise` is the standard deviation of white noise whose
+    second differences are as large. All samples that are no spikes are from `lowest` to `highest`.
     """
 
     low: float
@@ -167,10 +168,9 @@ def state_levels(samples: FloatArray, known: StateLevels | None = None) -> State
     noise = _noise(kept)
     if not as_pulses and (coarse or noise > _QUIET * levels.difference):
         return replace(levels, significant=False)
-    near = _CLOSE * levels.difference
-    at_levels = np.count_nonzero(kept < levels.low + near) + np.count_nonzero(
-        kept > levels.high - near)
-    pulsed = as_pulses and bool(levels.steep or at_levels > _AT_LEVELS * kept.size)
+    half_way = np.abs(kept - 0.5 * (levels.low + levels.high)) < 0.2 * levels.difference
+    pulsed = as_pulses and bool(levels.steep or (
+        noise < _QUIET * levels.difference and np.mean(half_way) < _HALF_WAY))
     return replace(levels, share=share, pulsed=pulsed, noise=noise,
                    lowest=float(kept.min()), highest=float(kept.max()))
 
@@ -238,8 +238,7 @@ def _range(samples: FloatArray) -> tuple[float, float]:
 def _modes(samples: FloatArray) -> StateLevels:
     """Return the modes of both halves of the amplitudes."""
     low, high = _range(samples)
-    half = 0.5 * (low + high)
-    upper = samples > half
+    upper = samples > 0.5 * (low + high)
     if not low < high:
         return StateLevels(low, high, significant=False)
     contrast = float(samples[upper].mean() - samples[~upper].mean())
