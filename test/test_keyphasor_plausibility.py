@@ -198,7 +198,7 @@ def test_bad_channels_are_left_out_and_named(recording):
     assert found.channel_names == ('bearing', 'clipped')
     assert [text.split(':')[0] for text in remarks] == [
         'loose is NaN or infinite in 100% of its samples and is left out',
-        'dead is constant and is left out', remarks[2].split(':')[0]]
+        'dead is constant at 0 and is left out', remarks[2].split(':')[0]]
     assert remarks[2].startswith('clipped is saturated in')
 
 
@@ -266,7 +266,8 @@ def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
     assert close_loop.main([str(tmp_path / 'rig.npz'), '--declared', str(tmp_path / 'model.yaml'),
                             '--output', str(tmp_path / 'out'), '--quiet']) == 0
     said = capsys.readouterr().err.splitlines()
-    assert f'close_loop: warning: {tmp_path / "rig.npz"}: dead is constant and is left out' in said
+    assert (f'close_loop: warning: {tmp_path / "rig.npz"}: dead is constant at 0 and is left '
+            'out') in said
     assert len(said) == 3
 
 

@@ -97,7 +97,7 @@ def test_channel_of_nearly_nothing_or_nothing_new_is_left_out(recording, found):
         both = close_loop(Recording(ArraySource(samples), RATE,
                                     pulse_times=recording.pulse_times), KEYWORDS)
     assert {str(item.message).partition(': ')[2] for item in said} == {
-        'channel 1 is constant and is left out',
+        f'channel 1 is constant at {samples[1, 0]:.6g} and is left out',
         'channel 2 holds the samples of channel 0 again and is left out'}
     assert both.report['missing_effects'] == found.report['missing_effects']
     with pytest.warns(DataWarning, match='channel 0 is constant'):

@@ -33,7 +33,6 @@ from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
 from std_msgs.msg import Float64MultiArray
 
-ROUNDING = 1e-9  # relative scatter of a constant that was resampled
 _ORDERS = 10  # of a summary, the strongest ones
 _THERE = 2.45  # standard errors of an amplitude that noise alone passes in 5 %
 _STATUS = dict(zip(('', *LEVELS), (
@@ -76,13 +75,6 @@ class ShaftOutput:
         self.published += 1
         self._node.set_missing(f'condition indicators of {self._name}', self._results.problem)
         self._node.set_missing(f'envelope of {self._name}', self._results.bearing_problem)
-        constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])
-        lacking = np.all(np.isnan(average.waveform), axis=1)
-        for channel, (is_constant, is_lacking) in enumerate(zip(constant, lacking)):
-            what = f'constant at {average.waveform[channel, 0]:.6g}' if is_constant else (
-                'NaN or infinite' if is_lacking and average.fundamental_cycles else '')
-            self._node.set_missing(f'channel {channel} of vibration', (
-                f'{what}, look at its sensor and cable' if what else ''))
         if (correction := average.correction) is None:  # not asked for
             self._refusals = Shortfall()
         else:

@@ -25,12 +25,14 @@ from sa_jitter_ros.nodes.messages import (
     SampleDecoder)
 from sa_jitter_ros.parameters import Values
 from sa_jitter_ros.pulses.sampled_angle import AngleCrossings
+from sa_jitter_ros.recordings.channel_check import bad_channels, with_advice
 from sa_jitter_ros.recordings.channel_units import Channels, scale_of
 from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import TimeReference
 
 NO_HEADER = ('messages have no header: sample times are counted from start_time, and lost samples '
              'are not detected; send time, sampling rate and index of the first sample')
+_JUDGED = 4096  # samples by which channels are judged
 
 
 class SampleInput:
@@ -69,6 +71,31 @@ class SampleInput:
         if self._decoder.counted:
             self._node.show_warning(NO_HEADER)
         self._node.set_missing('samples', self._decoder.doubt)
+
+
+class ChannelWatch:
+    """Says about once a second which channels of the vibration are constant or saturated."""
+
+    def __init__(self) -> None:
+        self._blocks: list[FloatArray] = []
+        self._held = 0
+
+    def add(self, samples: FloatArray) -> None:
+        """Take samples (channel, sample), of which as many as a judgement needs are kept."""
+        if self._blocks and len(samples) != len(self._blocks[0]):
+            self._blocks, self._held = [], 0
+        if self._held < _JUDGED:
+            self._blocks.append(samples)
+            self._held += samples.shape[1]
+
+    def say(self, node: MonitoringNode) -> None:
+        """Say what is wrong with channels, once enough samples have come."""
+        if self._held >= _JUDGED:
+            samples = np.hstack(self._blocks)
+            self._blocks, self._held, faults = [], 0, bad_channels(samples)
+            for channel in range(len(samples)):
+                node.set_missing(f'channel {channel} of vibration',
+                                 with_advice(faults[channel]) if channel in faults else '')
 
 
 class PulseOutput:

@@ -31,7 +31,7 @@ from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.messages import (
     decode_pulse_array, decode_pulse_reference, encode_geometry, known_type, PULSE_TYPES)
-from sa_jitter_ros.nodes.signals import SampleInput
+from sa_jitter_ros.nodes.signals import ChannelWatch, SampleInput
 from sa_jitter_ros.parameters import require_shaft_names, Values
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings.channel_units import channels_of
@@ -70,6 +70,7 @@ class SynchronousAverager(MonitoringNode):
         self._sources: set[str] = set()  # of tach pulses
         self._other_keyphasors, self._cycles_per_second = 0, 0.0
         self._samples = SampleInput(self, values, self.parameters.declare_channels())
+        self._channels = ChannelWatch()
         pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')
         self._target = self.create_output(Float64MultiArray, 'target_geometry', LATCHED_QOS)
@@ -119,6 +120,7 @@ class SynchronousAverager(MonitoringNode):
             self.counts['messages_rejected'] += 1
             raise
         self._vibration_flow.came()
+        self._channels.add(block.samples)
         self._publish(averages)
 
     def _on_pulse_reference(self, message: Any) -> None:
@@ -178,6 +180,7 @@ class SynchronousAverager(MonitoringNode):
         averager = self._averager
         self._samples.show_warning()
         self.counts.update(averager.totals)
+        self._channels.say(self)
         if not self._values['keyphasor']:  # which makes others expected
             self.counts['pulses_dropped'] += self._other_keyphasors
         if self._cycles_per_second:

@@ -37,7 +37,7 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
 
     >>> time = np.arange(1000)
     >>> bad_channels(np.array([np.sin(0.1 * time), 0.0 * time, np.clip(np.sin(time), -0.5, 0.5)]))
-    {1: 'is constant', 2: 'is saturated in 66% of its samples'}
+    {1: 'is constant at 0', 2: 'is saturated in 66% of its samples'}
     """
     found: dict[int, str] = {}
     for channel, values in enumerate(samples):
@@ -50,7 +50,7 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
         elif finite.size < _FEWEST:
             continue
         elif np.ptp(finite) < LEAST_RANGE:
-            found[channel] = 'is constant'
+            found[channel] = f'is constant at {finite[0]:.6g}'
         else:
             low, high = finite.min(), finite.max()
             top, bottom = float(np.mean(finite == high)), float(np.mean(finite == low))
@@ -151,7 +151,7 @@ def usable_channels(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     >>> rig = Recording(ArraySource(np.array([rng.normal(size=900), np.zeros(900)])), 1e3)
     >>> rig, remarks = usable_channels(rig)
     >>> rig.channel_names, remarks
-    (('channel 0',), ('channel 1 is constant and is left out: check its sensor and cable',))
+    (('channel 0',), ('channel 1 is constant at 0 and is left out: check its sensor and cable',))
     """
     faults = channel_faults(recording)
     lost = {channel for channel, reason in faults.items() if is_lost(reason)}
@@ -160,8 +160,12 @@ def usable_channels(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
 
 def fault_texts(recording: Recording, faults: Mapping[int, str]) -> tuple[str, ...]:
     """Return a sentence for each bad channel of a recording, with what to do about it."""
-    return tuple(
-        f'{recording.channel_names[channel]} {reason}'
-        + (' and is left out: check its sensor and cable' if is_lost(reason) else
-           ': lower its gain, or choose a larger range')
-        for channel, reason in faults.items())
+    return tuple(f'{recording.channel_names[channel]} '
+                 + with_advice(reason, lost=' and is left out')
+                 for channel, reason in faults.items())
+
+
+def with_advice(reason: str, *, lost: str = '') -> str:
+    """Return why a channel is bad and what to do; `lost` is what becomes of one without any."""
+    return reason + (f'{lost}: check its sensor and cable' if is_lost(reason) else
+                     ': lower its gain, or choose a larger range')
