@@ -178,6 +178,15 @@ def test_lines_of_the_vibration_tell_even_marks(rng, marks, orders):
     assert values(check, 'ratio', 'orders') == (1.0, [order for order, _ in orders])
 
 
+@pytest.mark.machines
+def test_a_mesh_of_another_shaft_does_not_exclude_one_mark(rng):
+    """Gears of 19 teeth at ratio 183/76 make lines at multiples of a quarter of the speed."""
+    check = checked(vibration(rng, orders=[(k * 19 * 183 / 76, 1.0 / k) for k in (1, 2, 3)]),
+                    tach(rng, 1)[0])
+    count = check.findings['pulses_per_revolution']
+    assert count.value == 1 or dict(count.alternatives)[1] > 0.05
+
+
 def test_even_marks_without_vibration_are_listed_with_what_would_decide(rng):
     check = checked(rng.normal(0.0, 1.0, (1, int(SECONDS * RATE))), tach(rng, 2)[0])
     count = check.findings['pulses_per_revolution']

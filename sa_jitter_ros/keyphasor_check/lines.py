@@ -43,7 +43,9 @@ _STRONGEST = 3e-3  # of the strongest line; below it are side lobes and distorti
 # Width of a line's place in bins of the spectrum.
 _WIDTH = 0.6
 _FOLLOWS = 0.7  # probability that a line is an order of a shaft that is considered
-_COINCIDENCE = 2.5  # the most that families on fractions of the mark rate say: ratios are, too
+# The most that families on fractions of the mark rate say, each of meshes beyond it: ratios of
+# gears are fractions, too.
+_COINCIDENCE = 2.5
 _MEMBER = 0.25  # what each further multiple of a line says, in parts of the first
 # A vibration that repeats several times in a revolution is so improbable.
 _SYMMETRY = 1.5
@@ -152,15 +154,15 @@ def marks_evidence(lines: ToothLines | None, counts: Sequence[int]) -> dict[int,
     Lines are in cycles a mark. A target with more marks than the lines need is possible: the
     vibration then repeats several times in a revolution.
     """
-    log = dict.fromkeys(counts, 0.0)
     if lines is None or not lines.places.size:
-        return log
-    families = _families(lines)
-    geared = bool(np.any(on_orders(lines, 1.0)[1]))
-    strays = -math.inf if geared else len(families) * math.log(1.0 - _FOLLOWS)
+        return dict.fromkeys(counts, 0.0)
+    families, log = _families(lines), dict.fromkeys(counts, 0.0)
+    strays = -math.inf if np.any(on_orders(lines, 1.0)[1]) else (
+        len(families) * math.log(1.0 - _FOLLOWS))
     for count in counts:
         said = [_says(lines, family, count) for family in families]
-        chance = sum(value for value, certain in said if not certain)
+        chance = sum(min(value, _COINCIDENCE) if lines.places[family[0]] > 1.0 else value
+                     for (value, certain), family in zip(said, families) if not certain)
         log[count] = sum(value for value, certain in said if certain) + max(
             min(chance, _COINCIDENCE), chance + strays)
     return {count: max([value, *(log[part] - _SYMMETRY - math.log(count / part)
@@ -292,8 +294,8 @@ def speed_ripples(samples: FloatArray, start: float, rate: float, fitted: Fitted
     its power over the angle is in fewer lines with the right one.
     """
     pattern = fitted.pattern
-    uneven = float(np.ptp(pattern.marks)) / pattern.teeth
-    if pattern.present < _SEVERAL_MARKS or uneven < _EVEN or fitted.breaks.size:
+    if pattern.present < _SEVERAL_MARKS or fitted.breaks.size or (
+            np.ptp(pattern.marks) < _EVEN * pattern.teeth):
         return False
     shares = []
     for times in (fitted.measured, fitted.true):
