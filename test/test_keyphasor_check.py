@@ -167,6 +167,26 @@ def test_a_slow_hunting_of_the_speed_and_the_beat_of_a_clock_are_no_wheel(huntin
 
 
 @pytest.mark.machines
+def test_a_swing_of_the_speed_is_no_wheel_of_several_marks_but_an_eccentric_wheel_is(rng):
+    """Both move pulses by a sine; that of a wheel keeps step with the pulses."""
+    wheels = swings = 0
+    for _ in range(40):
+        time = np.linspace(0.0, 100.0, 200_001)
+        speed, swing = rng.uniform(1.0, 6.0), rng.uniform(0.2, 0.45)
+        turned = speed * time + 0.01 * np.sin(2.0 * np.pi * swing * time)
+        times = np.interp(np.arange(1.0, turned[-1]), turned, time)
+        swings += not patterns(number_pulses(times + 1e-5 * rng.standard_normal(times.size)))
+
+        marks = int(rng.integers(5, 17))
+        numbers = np.arange(1.0, speed * 100.0)
+        times = (numbers + 0.01 * np.sin(2.0 * np.pi * numbers / marks)) / speed
+        found = patterns(number_pulses(times + 1e-5 * rng.standard_normal(times.size)))
+        wheels += bool(found) and found[0].teeth == marks
+    assert wheels == 40
+    assert swings >= 20  # the others nearly keep step over these 100 s
+
+
+@pytest.mark.machines
 @pytest.mark.parametrize(('marks', 'orders'), [
     (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS),
     *((marks, ((1.0, 1.0), (19.0, 0.6), (38.0, 0.3))) for marks in (20, 60))])

@@ -39,6 +39,7 @@ _MOSTLY = 0.67  # at most so many teeth are missing
 # Likelihoods hold for independent errors; those of pulses and speeds are not.
 _TEMPER = 0.3
 _CLEAR, _MOST_PATTERNS = 3.0, 4
+_STEPS = 16  # parts of a recording, in which a pattern is compared
 # What neighbours share is the motion: weights of the pulses around one.
 _AROUND = np.bartlett(43)[1:-1] / 21.0
 _ROUNDED = 0.25  # mean distance of times from the middle of their ticks, in ticks
@@ -88,8 +89,8 @@ def patterns(pulses: NumberedPulses) -> list[Marking]:
     span = int(numbers[-1] - numbers[0]) + 1
     most = min(_MOST_TEETH, span // _FEWEST_REVOLUTIONS)
     ticks = find_clock(pulses.times).rate * float(np.median(pulses.pitch))
-    evidence = _Evidence(numbers, places - convolve1d(places, _AROUND, mode='nearest'),
-                         _ROUNDED / ticks if ticks else 0.0)
+    places = places - convolve1d(places, _AROUND, mode='nearest')
+    evidence = _Evidence(numbers, places, _ROUNDED / ticks if ticks else 0.0)
     even = evidence.of(1)
     gains = np.array([evidence.of(n) - even for n in range(2, most + 1)])
     found: list[Marking] = []
@@ -97,9 +98,26 @@ def patterns(pulses: NumberedPulses) -> list[Marking]:
         teeth, gain = int(index) + 2, float(gains[index])
         if gain <= _CLEAR or len(found) == _MOST_PATTERNS:
             break
-        if not any(teeth % item.teeth == 0 for item in found):
+        if not any(teeth % item.teeth == 0 for item in found) and (
+                _keeps_step(numbers, places, teeth)):
             found.append(_once(pulses, pattern_of(pulses, teeth, gain)))
     return found
+
+
+def _keeps_step(numbers: IntArray, places: FloatArray, teeth: int) -> bool:
+    """
+    Return whether pulses of these numbers, at these places (n,), repeat with a target of `teeth`.
+
+    A swing of the speed nearly repeats after some pulses, too, but falls out of step in time.
+    """
+    classes = numbers % teeth
+    mean = np.bincount(classes, places, teeth) / np.maximum(np.bincount(classes, None, teeth), 1)
+    strongest = 1 + int(np.argmax(np.abs(np.fft.rfft(mean)[1:])))
+    swing = places * np.exp(-2j * np.pi * strongest / teeth * numbers)
+    part = (numbers - numbers[0]) * _STEPS // (int(numbers[-1] - numbers[0]) + 1)
+    sums = np.bincount(part, swing.real, _STEPS) + 1j * np.bincount(part, swing.imag, _STEPS)
+    power = np.abs(np.fft.fft(sums * np.hanning(_STEPS + 2)[1:-1], 8 * _STEPS)) ** 2
+    return bool(_TEMPER * (power.max() - power[0]) <= _CLEAR * np.median(power) / math.log(2.0))
 
 
 def _once(pulses: NumberedPulses, pattern: Marking) -> Marking:
