@@ -447,6 +447,15 @@ def test_hum_between_slow_pulses_is_none():
     assert wrong <= 0.03 * trials
 
 
+@pytest.mark.parametrize('seconds', [1, 3, 6])
+def test_a_fast_sine_is_found_in_recordings_of_any_length(seconds):
+    t = np.arange(100_000 * seconds) / 1e5
+    wave = np.sin(2.0 * np.pi * 9_900.0 * t)
+    assert detect(wave, rate=1e5)[0].size == pytest.approx(9_900 * seconds, abs=2)
+    assert detect(wave, rate=1e5, cuts=range(5000, t.size, 5000))[0].size == pytest.approx(
+        9_900 * seconds, abs=2)
+
+
 def test_a_sine_waits_for_its_levels_and_loses_nothing():
     t = np.arange(round(12.0 * RATE)) / RATE
     detector = KeyphasorDetector()

@@ -45,7 +45,9 @@ _DRIFTED = 0.5
 # Half of the hysteresis: at least so many standard deviations of the noise, by which a slow edge
 # crosses the threshold several times, but at most this fraction of the level difference.
 _BEYOND_NOISE, _WIDEST = 4.0, 0.2
-_SLOW = 8  # windows after which a signal that does not rest at its levels is no hum
+# Windows after which a signal that does not rest at its levels is no hum, unless more than a few
+# samples are so many times as far apart as these.
+_SLOW, _FEW, _BEYOND_HUM = 8, 5e-3, 3.0
 _FEWEST = 40  # samples from which levels are learnt: ten intervals of four
 # The longest window, s and samples: two pulses of a shaft at 0.05 Hz, or 32 MB.
 _LONGEST, _MOST = 64.0, 1 << 22
@@ -193,7 +195,7 @@ class KeyphasorDetector:
         """Return the pulse times (s) in samples that wait for levels, at a recording's end."""
         size, found = self._held, _NONE
         while size and self._levels is None:
-            found = self._learn(size, whole=size < self._held)
+            found = self._learn(size, whole=size < self._held, early=False)
             size = size // 2 if size > self._shortest else 0
         self._end()
         return found
@@ -215,7 +217,14 @@ class KeyphasorDetector:
             self._window = _last(self._window, self._held)
         return found
 
-    def _learn(self, size: int, *, whole: bool) -> FloatArray:
+    def _hum(self, levels: StateLevels, *, early: bool) -> bool:
+        """Return whether there may be more than these levels in the samples that wait."""
+        if early and self._held < _SLOW * self._shortest:
+            return True
+        every = np.concatenate([part for *_, part in self._window])[::self._held // _READ + 1]
+        return bool(np.ptp(np.quantile(every, [_FEW, 1 - _FEW])) > _BEYOND_HUM * levels.difference)
+
+    def _learn(self, size: int, *, whole: bool, early: bool = True) -> FloatArray:
         """Learn the levels from the last samples; return the pulses that waited for them."""
         window = np.concatenate([part for *_, part in _last(self._window, size)])
         window = window[::math.ceil(size / max(_READ, self._shortest))]
@@ -227,8 +236,8 @@ class KeyphasorDetector:
         slow = self._shortest < self._learnt >= size  # they are of pulses longer than this
         stopped = known and self._confirmed and (slow or not levels.pulsed) and (
             levels.difference < _STOPPED * known.difference)
-        hum = not known and not levels.pulsed and size < _SLOW * self._shortest
-        if stopped or not useful or (whole and (hum or not whole_pulses(window, levels))):
+        if stopped or not useful or (whole and not whole_pulses(window, levels)) or (
+                not known and not levels.pulsed and self._hum(levels, early=early)):
             return _NONE
         waiting, self._window, self._held = self._window, [], 0
         if known is None:
