@@ -447,6 +447,27 @@ def test_hum_between_slow_pulses_is_none():
     assert wrong <= 0.03 * trials
 
 
+@pytest.mark.parametrize(('least', 'most'), [(0.04, 2.0), (-1.0, 0.7)])
+def test_slow_edges_in_noise_that_a_rail_clips_are_one_pulse_each(rng, least, most):
+    for _ in range(10):
+        speed, duty = 10.0 ** rng.uniform(-0.5, 1.0), rng.uniform(0.2, 0.6)
+        t = np.arange(round(20.0 / speed * 5e3)) / 5e3
+        turned = (speed * t + 0.7) % 1.0
+        wave = np.where(turned < duty, np.sin(np.pi * turned / duty), 0.0)
+        wave = np.clip(wave + 0.03 * rng.standard_normal(t.size), least, most)
+        assert detect(np.round(255.0 * wave) / 255.0, rate=5e3)[0].size == 20
+
+
+def test_spikes_of_both_signs_do_not_take_the_place_of_pulses(rng):
+    wrong = 0
+    for _ in range(40):
+        t = np.arange(9000) / 2e4
+        wave = (200.0 * t % 1.0 < rng.uniform(0.2, 0.8)) + 0.01 * rng.standard_normal(t.size)
+        wave[rng.integers(t.size, size=3)] += rng.uniform(4.0, 40.0, 3) * [1.0, -1.0, -1.0]
+        wrong += abs(detect(wave, rate=2e4)[0].size - 90) > 3
+    assert wrong <= 1
+
+
 @pytest.mark.parametrize('seconds', [1, 3, 6])
 def test_a_fast_sine_is_found_in_recordings_of_any_length(seconds):
     t = np.arange(100_000 * seconds) / 1e5

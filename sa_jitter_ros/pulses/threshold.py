@@ -63,6 +63,8 @@ _LONG, _STEPS = 2.5, 2.5
 _WHOLE, _QUIET, _BEYOND = 2, 0.1, 4.0
 # Samples of an edge that are kept at most, and how often a line is fitted to those in the band.
 _LONGEST, _ROUNDS = 1 << 16, 3
+# Share of clipped samples that hide the noise, and second differences that show it.
+_CLIPPED, _READABLE = 0.2, 50
 _SECOND = 0.6745 * math.sqrt(6.0)  # median of second differences of white noise of size 1
 _TINY = float(np.finfo(np.float64).tiny)
 
@@ -223,9 +225,18 @@ def _changes_as_pulses(levels: StateLevels, samples: FloatArray, *, coarse: bool
 
 
 def _noise(samples: FloatArray) -> float:
-    """Return the standard deviation of white noise whose second differences are as large."""
+    """
+    Return the standard deviation of white noise whose second differences are as large.
+
+    Where many samples are clipped, it is that of those which are not.
+    """
     bends = np.abs(np.diff(samples, 2))
-    return float(np.median(bends)) / _SECOND if bends.size else 0.0
+    if not bends.size:
+        return 0.0
+    clipped = (samples == samples.min()) | (samples == samples.max())
+    free = bends[~(clipped[2:] | clipped[1:-1] | clipped[:-2])]
+    enough = np.mean(clipped) > _CLIPPED and free.size > _READABLE
+    return float(np.median(free if enough else bends)) / _SECOND
 
 
 def _range(samples: FloatArray) -> tuple[float, float]:
@@ -284,6 +295,7 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
     Without them there are many more pulses, in a smaller range.
     """
     kept, spikes, longest = samples, 0, 0
+    found, most = samples, 0
     for _ in range(_SIZES):
         low, high = _range(kept)
         if not low < high:
@@ -302,9 +314,10 @@ def _without_spikes(samples: FloatArray) -> FloatArray:
             pulses, over = _runs(above if 2 * np.count_nonzero(above) < kept.size else ~above)
             short = max(_SHORT, 0.5 * float(np.median(over - pulses))) if pulses.size else 0.0
             few = spikes <= max(_FEW_SPIKES, pulses.size // _PULSES_EACH)
-            if few and spikes < pulses.size and longest <= short:
-                return kept
-    return samples
+            # What remains after the spikes of one sign may be those of the other.
+            if few and max(spikes, 2 * most) < pulses.size and longest <= short:
+                found, most = kept, pulses.size
+    return found
 
 
 def _passed_by_all(samples: FloatArray) -> StateLevels | None:
