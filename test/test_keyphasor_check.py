@@ -199,6 +199,15 @@ def test_lines_of_the_vibration_tell_even_marks(rng, marks, orders):
 
 
 @pytest.mark.machines
+@pytest.mark.parametrize(('teeth', 'gap'), [(60, 2), (36, 1)])
+def test_half_orders_of_an_engine_do_not_double_its_wheel(rng, teeth, gap):
+    orders = [(1.0, 0.3), (2.0, 1.0), (4.0, 0.6), (0.5, 0.15), (1.5, 0.15), (2.5, 0.1)]
+    check = checked(vibration(rng, orders=orders),
+                    tach(rng, teeth, missing=range(teeth - gap, teeth))[0])
+    assert values(check, 'pulses_per_revolution', 'missing_teeth') == (teeth, gap)
+
+
+@pytest.mark.machines
 def test_a_mesh_of_another_shaft_does_not_exclude_one_mark(rng):
     """Gears of 19 teeth at ratio 183/76 make lines at multiples of a quarter of the speed."""
     check = checked(vibration(rng, orders=[(k * 19 * 183 / 76, 1.0 / k) for k in (1, 2, 3)]),

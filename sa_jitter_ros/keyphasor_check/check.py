@@ -286,9 +286,11 @@ class _Check:
             vibration[declared] += _DECLARED * orders_seen(
                 lines.scaled(float(declared)), self._recording.ratio, self._recording.orders)
         log = {}
+        # Half orders are those of an engine: the gaps of its wheel do not repeat in a revolution.
         for count in counts:
             pattern = max((item.evidence - (0.0 if count == item.teeth else _SYMMETRY + math.log(
-                count / item.teeth)) for item in found if count % item.teeth == 0), default=0.0)
+                count / item.teeth)) for item in found if count % item.teeth == 0 and (
+                    not item.missing.any() or count in (item.teeth, declared))), default=0.0)
             log[count] = usual_marks(count) + vibration[count] + pattern
         if declared > 1:
             log[declared] += _DECLARED
