@@ -441,8 +441,7 @@ def test_hum_between_slow_pulses_is_none():
         wave = (turns % 1.0 < rng.uniform(0.05, 0.9)) + rng.uniform(0.01, 0.045) * np.sin(
             2.0 * np.pi * rng.choice([50.0, 60.0, 100.0]) * t) + rng.choice(
                 [0.001, 0.01]) * rng.standard_normal(t.size)
-        found = detect(wave, rate=rate, cuts=rng.integers(t.size, size=9))[0]
-        wrong += found.size != np.floor(turns[-1]) - np.floor(turns[0])
+        wrong += sa.detect_pulses(wave, rate).size != np.floor(turns[-1]) - np.floor(turns[0])
     # a few times noise and hum rest at two levels by chance
     assert wrong <= 0.03 * trials
 
@@ -477,13 +476,15 @@ def test_a_fast_sine_is_found_in_recordings_of_any_length(seconds):
         9_900 * seconds, abs=2)
 
 
-def test_a_sine_waits_for_its_levels_and_loses_nothing():
+@pytest.mark.parametrize(('patient', 'windows'), [(False, 1), (True, 8)])
+def test_a_sine_waits_for_its_levels_in_recordings_alone_and_loses_nothing(patient, windows):
     t = np.arange(round(12.0 * RATE)) / RATE
     detector = KeyphasorDetector()
+    detector.patient = patient
     found = [detector.update(block, 0.5 * k, RATE) for k, block in enumerate(
         np.split(np.sin(2.0 * np.pi * 20.0 * t + 1.0), 24))]
-    assert [item.size for item in found[:7]] == [0] * 7
-    assert found[7].size == pytest.approx(80, abs=1)
+    assert [item.size for item in found[:windows - 1]] == [0] * (windows - 1)
+    assert found[windows - 1].size == pytest.approx(10 * windows, abs=1)
     assert np.allclose(np.diff(np.concatenate(found)), 0.05)
 
 

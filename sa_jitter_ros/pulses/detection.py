@@ -45,8 +45,8 @@ _DRIFTED = 0.5
 # Half of the hysteresis: at least so many standard deviations of the noise, by which a slow edge
 # crosses the threshold several times, but at most this fraction of the level difference.
 _BEYOND_NOISE, _WIDEST = 4.0, 0.2
-# Windows after which a signal that does not rest at its levels is no hum, unless more than a few
-# samples are so many times as far apart as these.
+# Windows of a recording after which a signal that does not rest at its levels is no hum, unless
+# more than a few samples are so many times as far apart as these.
 _SLOW, _FEW, _BEYOND_HUM = 8, 5e-3, 3.0
 _FEWEST = 40  # samples from which levels are learnt: ten intervals of four
 # The longest window, s and samples: two pulses of a shaft at 0.05 Hz, or 32 MB.
@@ -86,15 +86,15 @@ class KeyphasorDetector:
 
     The detector learns the two state levels from the first window that holds whole pulses, and
     updates them from each later one. Windows have `learning_time` seconds or, for slow shafts,
-    twice as many, and twice again, up to a minute; a waveform that does not rest at its first
-    levels may be hum before a slow pulse, and needs 8 windows. Samples wait until then, so that no
-    pulse is lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels that two windows
-    have agreed on change only where the next two agree on others, so that no single event,
-    whatever its size, moves them for longer. Up to three samples that are farther from all others
-    than these are apart are a spike, and are bridged. If no `threshold` is given, pulses with a
-    lobe on either side of the resting level, as a variable reluctance sensor makes them, have the
-    time of the steep crossing between the lobes. The time of a slow edge in noise is that of the
-    straight line through its samples.
+    twice as many, and twice again, up to a minute; in a recording, a waveform that does not rest
+    at its first levels may be hum before a slow pulse, and needs 8 windows. Samples wait until
+    then, so that no pulse is lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels
+    that two windows have agreed on change only where the next two agree on others, so that no
+    single event, whatever its size, moves them for longer. Up to three samples that are farther
+    from all others than these are apart are a spike, and are bridged. If no `threshold` is given,
+    pulses with a lobe on either side of the resting level, as a variable reluctance sensor makes
+    them, have the time of the steep crossing between the lobes. The time of a slow edge in noise
+    is that of the straight line through its samples.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
     :param hysteresis: width of the band around the threshold, a fraction of the level difference;
@@ -132,6 +132,8 @@ class KeyphasorDetector:
         self._edge, self._interpolate = edge, interpolate
         self._minimum_interval, self._learning_time = minimum_interval, learning_time
         self._minimum_difference = minimum_difference
+        #: Whether there is time to see more of a signal that does not rest at its first levels.
+        self.patient = False
         self._learns = threshold is None or hysteresis > 0.0 or polarity == 'auto'
         self.reset()
 
@@ -219,7 +221,7 @@ class KeyphasorDetector:
 
     def _hum(self, levels: StateLevels, *, early: bool) -> bool:
         """Return whether there may be more than these levels in the samples that wait."""
-        if early and self._held < _SLOW * self._shortest:
+        if early and self.patient and self._held < _SLOW * self._shortest:
             return True
         every = np.concatenate([part for *_, part in self._window])[::self._held // _READ + 1]
         return bool(np.ptp(np.quantile(every, [_FEW, 1 - _FEW])) > _BEYOND_HUM * levels.difference)
@@ -367,6 +369,7 @@ def detector_of(values: Values) -> KeyphasorDetector:
 
 def pulses_in_blocks(detector: KeyphasorDetector, blocks: Iterable[SampleBlock]) -> FloatArray:
     """Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap."""
+    detector.patient = True
     found = [detector.update(part.samples[0], part.start_time, part.sample_rate)
              for block in blocks for part in block.finite_parts()]
     return np.concatenate([*found, detector.flush()])
