@@ -21,6 +21,7 @@ import math
 import numpy as np
 from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import EFFECTS
+from sa_jitter_ros.effects.effect import RARE
 from sa_jitter_ros.effects.timing import PULSES, SOURCE
 from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser
@@ -36,7 +37,6 @@ _BESIDE = 8  # frequencies on either side of a sinusoid, that show what is there
 _FEWEST = 40  # pulses whose distribution is looked at
 _BEYOND = 100  # pulses that are drawn before and behind a stretch
 _FEW_VALUES = 12.0  # six swings, below which a random motion is not told from a drift
-_TAIL = 0.1  # share of the draws that are their tail
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ def _moments(values: Array) -> Array:
 
 def chance(value: float, draws: Array) -> float:
     """Return the chance of draws as large as a value; their tail is taken as exponential."""
-    high = float(np.quantile(draws, 1.0 - _TAIL))
+    high = float(np.quantile(draws, 1.0 - RARE))
     if value <= high:
         return float(np.mean(draws >= value))
-    return _TAIL * math.exp((high - value) / float(np.mean(draws[draws > high] - high)))
+    return RARE * math.exp((high - value) / float(np.mean(draws[draws > high] - high)))
