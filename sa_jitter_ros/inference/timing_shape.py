@@ -21,6 +21,7 @@ import math
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.effects.effect import RARE
 from sa_jitter_ros.inference.residual import DRAWS
 from sa_jitter_ros.inference.timing_data import TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
@@ -30,7 +31,6 @@ from scipy.special import ndtr
 
 EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see
-_STRAY = 0.02  # share of errors that may be anything
 _SEED, _PARTS = 11, 50
 
 
@@ -78,7 +78,8 @@ class Shapes:
             # the trend that was taken out is known as well as so many errors tell it
             trend = 2.0 / mean / values.size
             shaped = self._density(beyond, math.sqrt(power), math.sqrt(rest + trend))
-            total += float(np.sum(np.log((1.0 - _STRAY) * shaped / normal + _STRAY)))
+            # a rare one may be anything
+            total += float(np.sum(np.log((1.0 - RARE) * shaped / normal + RARE)))
         return total
 
     def _density(self, errors: Array, size: float, rest: float) -> Array:
