@@ -221,11 +221,15 @@ def refine(states: States) -> float:
     return furthest
 
 
-def prune(states: States, least: float) -> tuple[Array, Array, Array]:
-    """Take out undeclared lines whose amplitudes are noise; return `both_ways` of the others."""
+def prune(states: States) -> tuple[Array, Array, Array]:
+    """
+    Take out undeclared lines whose amplitudes are noise; return `both_ways` of the others.
+
+    On a mean channel, the others are more likely than none by the odds against a line.
+    """
     lines = states.amplitudes.shape[1]
     power = np.abs(states.amplitudes) ** 2 / states.amplitude_variances()
-    kept = (np.arange(lines) < states.declared) | (power.mean(axis=0) > 2.0 * least)
+    kept = (np.arange(lines) < states.declared) | (power.mean(axis=0) > 2.0 * ODDS)
     orders, tones = np.split(kept, [states.orders.size])
     states.orders, states.tones = states.orders[orders], states.tones[tones]
     return fit_lines(states)

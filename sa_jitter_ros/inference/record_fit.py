@@ -33,7 +33,6 @@ from scipy.special import gammaincc
 
 # Steps that a search may take, and what its last one may change, in standard errors.
 _MOST_STEPS, _SETTLED = 20, 0.1
-_PRUNED = 4.0  # mean power of a line in its variances that keeps it
 # The last fit expects pulse errors that are so many times as large as they, or their standard
 # errors, are, so that they are hardly shrunk.
 _WEAK = 3.0
@@ -159,14 +158,14 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
                 break
             before = likelihood
     if look:
-        let_stand(states, prune(states, _PRUNED), searching=False)
+        let_stand(states, prune(states), searching=False)
         for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
             moved = refine(states)
             fit_lines(states)
             states.step()
             if moved < _SETTLED:
                 break
-        prune(states, _PRUNED)
+        prune(states)
 
 
 def _result(states: States, false_alarm: float) -> RecordFit:
