@@ -32,11 +32,11 @@ from sa_jitter_ros.inference.order_band import band_end
 from sa_jitter_ros.inference.record_fit import OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.residual import ACCURACY
+from sa_jitter_ros.inference.timing_data import FEWEST
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from scipy import special
 
-_FEWEST = 8  # pulses in a stretch
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
 _WIDER = 16.0  # band in which lines are looked for where the declared ones show no errors
@@ -183,7 +183,7 @@ def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> l
     bounds = np.append(np.flatnonzero(breaks), times.size)
     starts = np.append(0, bounds[:-1])
     return [slice(a, b) for a, b in zip(starts.tolist(), bounds.tolist())
-            if b - a >= _FEWEST and inside[a]]
+            if b - a > FEWEST and inside[a]]
 
 
 def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
