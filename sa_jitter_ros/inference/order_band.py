@@ -32,8 +32,7 @@ BEYOND_LINES, EDGE = 3.0, 1.15
 # what lies further away does not leak into a cycle.
 _BEYOND = 6.0
 _SAMPLES = 3.7  # in a period of the band's end
-# Trigger cycles between two speeds that an even time follows; what it leaves to the band's edge.
-_KNOTS, _STEADY = 10, 1.05
+_KNOTS = 10  # trigger cycles between two speeds that an even time follows
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class OrderBand:
         index[-1] = times.size - 1
         pace = np.diff(times[index]) / np.diff(index) / period
         slow, fast = (float(pace.max()), 1.0 / float(pace.min())) if index.size > 3 else (1.0, 1.0)
-        if max(slow, fast) < _STEADY:
+        if max(slow, fast) < EDGE:  # all of the band stays below the low pass
             return cls(*_low_passed(samples, rate, top / period), start)
         time, turned = CubicSpline(period * index, times[index]), period * index[[0, -1]]
         low, low_rate = _low_passed(samples, rate, fast * top / period)
