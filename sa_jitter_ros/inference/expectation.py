@@ -30,6 +30,7 @@ from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.inference.cycle_reader import kept_apart
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.order_band import BEYOND_LINES
+from sa_jitter_ros.inference.residual import ACCURACY_OF_CHANGE
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.amplitudes import (
     Amplitudes, component_gain, known_amplitudes, line_variance, unit_amplitudes)
@@ -51,8 +52,6 @@ _NODES = 32  # of an integral over a cycle, and of each panel of a longer one
 _PLACES = 12  # in a cycle, where errors turn hardly
 # Draws of all lines of all acquisitions together: many, of each as many as tell a mean, at most.
 _MANY_VALUES, _ENOUGH, _MOST_VALUES = 200_000, 4096, 1_000_000
-# Speeds closer than this are the same: no amplitude changes by more than 1e-3.
-_SPEED_STEP = 2e-3
 _SHARPEST = 2.0
 
 
@@ -356,7 +355,9 @@ def _speed(item: Acquisition, model: DeclaredModel) -> float:
     ratio = model.trigger_period / item.period
     if item.missing.any():
         return float(model.trigger_speed * ratio)
-    return float(model.trigger_speed * (1.0 + _SPEED_STEP * np.rint((ratio - 1.0) / _SPEED_STEP)))
+    # no amplitude changes by more between speeds as near as that
+    step = ACCURACY_OF_CHANGE
+    return float(model.trigger_speed * (1.0 + step * np.rint((ratio - 1.0) / step)))
 
 
 def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
