@@ -33,10 +33,9 @@ from scipy.optimize import minimize
 SHAFT, JITTER = 'shaft', 'jitter_scale'
 # Frequencies at which the spectrum of the motion is free.
 _KNOTS = 5
-_EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
-_SMOOTH = 3.0  # change of the slope of a free spectrum between knots
-_NOISE_KNOWN = 0.5  # what the logarithm of the noise power is known to
+_EDGE_SLOPE = 1.4  # of the motion beyond half the trigger rate
 _MEMORIES = 3.0  # least number of memories in a stretch: longer ones look like a drift
+_SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 
 
 class ShaftSpectrum:
@@ -104,7 +103,7 @@ class TimingFit:
         few = max(3, self.data.ordinates.shape[0] // 8)
         level = float(np.log(np.mean(np.abs(self.ordinates[:few, 0]) ** 2) + 1e-12))
         blocks: dict[str, tuple[Sequence[float], Sequence[float], Sequence[float]]] = {
-            SHAFT: ((min(level, 3.0),) * (_KNOTS - 1) + (-3.0, _EDGE_SLOPE[0]),
+            SHAFT: ((min(level, 3.0),) * (_KNOTS - 1) + (-3.0, _EDGE_SLOPE),
                     (-LARGE,) * _KNOTS + (0.7,), (LARGE,) * _KNOTS + (2.3,)),
             NOISE: ((0.0,), (-2.5,), (3.0,))}
         if self.free_jitter:
@@ -129,13 +128,14 @@ class TimingFit:
             self.parameters[at] = self.lower[at] = self.upper[at] = value
         self.parameters = np.clip(self.parameters, self.lower, self.upper)
         self._held = len(held)
-        # the prior is normal: residuals are `stiff` times the parameters, less the usual ones
+        # the prior is normal: residuals are `stiff` times the parameters, less the usual ones;
+        # the slope of the motion beyond the knots and the noise are known to a factor e
         self._stiff = np.zeros((_KNOTS, begin))
         self._stiff[:-2, self.place[SHAFT]][:, :_KNOTS] = np.diff(np.eye(_KNOTS), 2, 0) / _SMOOTH
-        self._stiff[-2, self.place[SHAFT].stop - 1] = 1.0 / _EDGE_SLOPE[1]
-        self._stiff[-1, self.place[NOISE]] = 1.0 / _NOISE_KNOWN
+        self._stiff[-2, self.place[SHAFT].stop - 1] = 1.0
+        self._stiff[-1, self.place[NOISE]] = 1.0
         self._usual = np.zeros(_KNOTS)
-        self._usual[-2] = _EDGE_SLOPE[0] / _EDGE_SLOPE[1]
+        self._usual[-2] = _EDGE_SLOPE
 
     def _maximise(self) -> None:
         self.value = -np.inf
