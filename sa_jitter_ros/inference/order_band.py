@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from sa_jitter_ros.arrays import Array
+from sa_jitter_ros.inference.timing_data import FEWEST
 from sa_jitter_ros.pulses.resampling import FULL_BAND, interpolate
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.interpolate import CubicSpline
@@ -32,7 +33,6 @@ BEYOND_LINES, EDGE = 3.0, 1.15
 # what lies further away does not leak into a cycle.
 _BEYOND = 6.0
 _SAMPLES = 3.7  # in a period of the band's end
-_KNOTS = 10  # trigger cycles between two speeds that an even time follows
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class OrderBand:
         It rolls off above it.
         """
         period = float(np.diff(times).mean())
-        index = np.arange(0, times.size, _KNOTS)
+        index = np.arange(0, times.size, FEWEST)  # speeds that an even time follows
         index[-1] = times.size - 1
         pace = np.diff(times[index]) / np.diff(index) / period
         slow, fast = (float(pace.max()), 1.0 / float(pace.min())) if index.size > 3 else (1.0, 1.0)
