@@ -31,7 +31,7 @@ from scipy.special import ndtr
 
 EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see
-_SEED, _PARTS = 11, 50
+_SEED = 11
 
 
 def through(values: Array, gain: Array, data: TimingData) -> Array:
@@ -54,7 +54,7 @@ class Shapes:
         draws = np.asarray(distribution.draw(np.random.default_rng(_SEED), (DRAWS,)))
         draws = (draws - draws.mean()) / draws.std()
         self.kurtosis = float(np.mean(draws**4)) - 3.0
-        self.edges = np.quantile(draws, np.linspace(0.0, 1.0, _PARTS + 1))
+        self.edges = np.quantile(draws, np.linspace(0.0, 1.0, math.isqrt(DRAWS) + 1))
 
     def gain(self, fit: TimingFit, errors: list[Array], power: float) -> float:
         """
