@@ -34,13 +34,14 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, Pattern
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.inference.candidates import Candidate
+from sa_jitter_ros.inference.record_fit import MOST_STEPS
 from sa_jitter_ros.inference.residual import NOTICEABLE
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
 from sa_jitter_ros.prediction.prediction import Prediction
 from scipy import special
 
-_STEPS, _EXACT = 20, 0.01  # of a logarithm of power
+_EXACT = 0.01  # of a logarithm of power
 #: The largest change that an effect beside others makes.
 Change = Callable[[Sequence[Effect], Effect], float]
 # Shares of effects that are there, in the open half of the table of decisions; as many of those
@@ -180,7 +181,7 @@ def _bound(timing: Timing, name: str, far: float) -> Array | None:
     low, high = min(at, FAINT) - 1.0, float(fit.upper[fit.place[name]][0])
     top, best, first, begin = high, -math.inf, fit.starts, fit.starts
     last: tuple[float, float] | None = None
-    for _ in range(_STEPS):
+    for _ in range(MOST_STEPS):
         tried = chooser.fit(names, begin, held={(name, 0): at})
         best = max(best, tried.value)
         if tried.value < best - far**2:

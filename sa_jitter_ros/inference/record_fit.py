@@ -31,8 +31,8 @@ from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
 
-# Steps that a search may take, and what its last one may change, in standard errors.
-_MOST_STEPS, _SETTLED = 20, 0.1
+#: Steps that a search may take, and what its last one may change, in standard errors.
+MOST_STEPS, _SETTLED = 20, 0.1
 # The last fit expects pulse errors that are so many times as large as they, or their standard
 # errors, are, so that they are hardly shrunk.
 _WEAK = 3.0
@@ -130,7 +130,7 @@ def _unknown(states: States) -> RecordFit:
 
 def _settle(states: States) -> None:
     """Do steps until the pulse errors hardly change: what they leave are lines, and no bends."""
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         if states.step() < _SETTLED * states.size[0] * np.sqrt(1.0 - states.resolved[0]):
             break
 
@@ -159,7 +159,7 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
             before = likelihood
     if look:
         let_stand(states, prune(states), searching=False)
-        for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
+        for _ in range(MOST_STEPS):  # each 0.6 of the one before where an order is near
             moved = refine(states)
             fit_lines(states)
             states.step()
