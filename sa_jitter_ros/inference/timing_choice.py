@@ -30,7 +30,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, possible, RARE
 from sa_jitter_ros.effects.excess_jitter import ExcessJitter
-from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
+from sa_jitter_ros.effects.lattice import ROOM, sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.phase_wander import PhaseWander
 from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.effects.timing import (
@@ -54,7 +54,6 @@ DECIDED = -math.log(RARE)
 # Logarithms of power and width, and of half the order, from which one of these is sought, beside
 # the rest of the motion and beside one of so much less, in its logarithm.
 _EDGES, _LESS = ((0.0, math.log(0.3), 1.4), (3.0, math.log(0.1), 1.4)), 6.0
-_STEP = 0.01  # of the tick by which the size of a pattern is varied, to either side
 
 
 @dataclass(frozen=True)
@@ -175,8 +174,8 @@ class Chooser:
 
         if fit.sizes.size != 1:
             return fit if ticks_leave_room(left(fit.sizes), noise, rate) else None
-        step = _STEP / (rate * self.data.unit * float(np.ptp(np.concatenate(columns, axis=1))))
-        tried = fit.sizes[0] + step * np.arange(-round(1.0 / _STEP), round(1.0 / _STEP) + 1)
+        step = ROOM / (rate * self.data.unit * float(np.ptp(np.concatenate(columns, axis=1))))
+        tried = fit.sizes[0] + step * np.arange(-round(1.0 / ROOM), round(1.0 / ROOM) + 1)
         possible, weight = sizes_within_ticks(
             lambda size: left(np.array([size])), tried, noise, rate)
         if not possible.size:
