@@ -19,12 +19,13 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, NARROWEST, recovered_correlation, SLOW_BAND, slow_band, slow_covariance,
     slow_memory, WIDEST)
-from sa_jitter_ros.effects.effect import Effect, parameter, require_below
+from sa_jitter_ros.effects.effect import Effect, parameter, RARE, require_below
 from sa_jitter_ros.effects.timing import FAINT, LARGE, low_passed, Setting, SOURCE, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-_STEEPEST = 4.0  # logarithm of half the order of a spectrum: it falls within 2 % of its width
+# Logarithm of half the order of a spectrum: it falls within a part of its width that is rare.
+_STEEPEST = -float(np.log(RARE))
 
 
 @dataclass(frozen=True)
