@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.arrays import BoolArray, FloatArray, IntArray
+from sa_jitter_ros.effects.effect import RARE
 from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.parameters import SAME_RATIO
@@ -24,7 +25,6 @@ from sa_jitter_ros.recordings.recording import Recording
 
 #: Of the declared speed, relative.
 SPEED_TOLERANCE = 0.1
-_SPEEDS = 0.05  # share of the cycles that are faster than the speeds of a run-up, and slower
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
@@ -151,7 +151,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
                              f'pulses: the loop needs {_FEWEST} in a row; record longer')
     slow, middle, fast = model.revolutions_per_trigger / np.quantile(
-        np.diff(found.times)[found.missing == 0], (1.0 - _SPEEDS, 0.5, _SPEEDS))
+        np.diff(found.times)[found.missing == 0], (1.0 - RARE, 0.5, RARE))
     if not slow * (1.0 - SPEED_TOLERANCE) <= model.trigger_speed <= fast * (1.0 + SPEED_TOLERANCE):
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
                          f'shaft turns at {middle:.4g} Hz: declare the speed and '
