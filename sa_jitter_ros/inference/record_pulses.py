@@ -25,7 +25,6 @@ from sa_jitter_ros.recordings.recording import Recording
 
 #: Of the declared speed, relative.
 SPEED_TOLERANCE = 0.1
-_MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
 _USUAL = 15  # pulses before a gap that tell how many it hides
@@ -137,9 +136,9 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         measured, recording.duration, model.pulses_per_revolution, step, **recording.target)
     counts, causes = validator.finish(), validator.take_messages()
     spurious = counts.doubles + counts.early
-    if spurious > _MOST_SPURIOUS * measured.size:
+    if spurious > RARE * measured.size:
         raise RecordingError(
-            f'{spurious} of {measured.size} pulses are spurious, more than {_MOST_SPURIOUS:.0%}: '
+            f'{spurious} of {measured.size} pulses are spurious, more than {RARE:.0%}: '
             + (causes or ['give the trigger more hysteresis'])[0])
     dropped = spurious + counts.unlocked
     if dropped > _MOST_DROPPED * measured.size:
