@@ -25,7 +25,6 @@ from sa_jitter_ros.recordings.recording import Recording
 
 #: Of the declared speed, relative.
 SPEED_TOLERANCE = 0.1
-_MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
 _USUAL = 15  # pulses before a gap that tell how many it hides
 _COVERED = 0.5  # of the pulses, by those of a reference keyphasor
@@ -141,7 +140,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
             f'{spurious} of {measured.size} pulses are spurious, more than {RARE:.0%}: '
             + (causes or ['give the trigger more hysteresis'])[0])
     dropped = spurious + counts.unlocked
-    if dropped > _MOST_DROPPED * measured.size:
+    if dropped > measured.size - dropped:  # most
         raise RecordingError(
             f'{dropped} of {measured.size} pulses follow each other at no interval that a shaft '
             'could have: ' + (causes or ['see what check_keyphasor finds in them'])[0])
