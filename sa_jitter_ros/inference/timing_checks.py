@@ -25,7 +25,7 @@ from sa_jitter_ros.effects.effect import RARE
 from sa_jitter_ros.effects.timing import PULSES, SOURCE
 from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser
-from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, TimingData
+from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import EDGE, through
 
@@ -36,7 +36,6 @@ _BINS = 5  # of frequency, whose excess power is taken together
 _BESIDE = 8  # frequencies on either side of a sinusoid, that show what is there without it
 _FEWEST = 40  # pulses whose distribution is looked at
 _BEYOND = 100  # pulses that are drawn before and behind a stretch
-_FEW_VALUES = 12.0  # six swings, below which a random motion is not told from a drift
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ def _drift(choice: Choice, name: str) -> Check:
     made = fit.density(name, fit.parameters)[0][0]
     power = float(np.average(made, weights=data.size))
     values = data.cycles * power**2 / float(np.average(made**2, weights=data.size))
-    return Check(0.0 if values < _FEW_VALUES else 1.0, fit.moves(name),
+    return Check(0.0 if values < FEWEST else 1.0, fit.moves(name),
                  data.unit * math.sqrt(power),
                  f'a drift of the {fit.moves(name)}, of which the recording holds about '
                  f'{values:.2g} independent values: too few to tell {name} from any other one')
