@@ -238,7 +238,7 @@ def _chance(mean: Array, rows: Array, bias: Sequence[Array]) -> float:
         draws = draws + rng.standard_normal((DRAWS, 1)) * item
     null = np.mean(draws**2, axis=1)
     below = float(np.mean(null >= statistic))
-    if below > 20.0 / DRAWS:
+    if below > FALSE_ALARM:
         return below
     # The tail beyond the draws is that of a scaled chi-squared variable of the same moments.
     freedom = 2.0 * null.mean() ** 2 / null.var()
