@@ -37,6 +37,8 @@ from scipy import special
 RARE = 0.05
 #: What a normal variable exceeds so seldom, in standard deviations.
 ONE_SIDED = -float(special.ndtri(RARE))
+#: Standard errors of a power, where there is none, below which no limit is.
+SEEN = 0.25
 #: Logarithm of the odds against an effect before any data: one in 150.
 ODDS = 5.0
 
@@ -71,15 +73,14 @@ def largest_power(value: float, count: float, noise: float, square: float, memor
     Return the 95 % limit of a random power of which `value` is an estimate, infinite for none.
 
     An estimate of a power p by `count` squares has the variance 2 / count times (`square`
-    + 2 `noise` p + `memory` p^2); that of the limit is a value as low as this once in 20 times. No
-    limit is below one standard error where there is no power.
+    + 2 `noise` p + `memory` p^2); that of the limit is a value as low as this once in 20 times.
     """
     chance = 2.0 * ONE_SIDED**2 / count
     left, middle = 1.0 - chance * memory, value + chance * noise
     if left <= 0.0:
         return math.inf
     beyond = math.sqrt(max(middle**2 + left * (chance * square - value**2), 0.0))
-    return max((middle + beyond) / left, math.sqrt(2.0 * square / count))
+    return max((middle + beyond) / left, SEEN * math.sqrt(2.0 * square / count))
 
 
 def most_scenarios(model: DeclaredModel, wanted: int = SCENARIOS) -> int:

@@ -34,6 +34,7 @@ from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _SEED = 6
+_PARTS = 8
 
 
 def _of_grid(setting: Setting) -> Array:
@@ -100,9 +101,8 @@ class KeyphasorQuantisation(Effect):
         periods = np.diff(setting.true_times)
         power = (periods - periods.mean()) ** 2
         # a slow speed moves neighbouring periods together: parts of the recording count
-        count = int(np.sqrt(power.size))
-        parts = [part.mean() for part in np.array_split(power, count)]
-        std, error = root(float(power.mean()), float(np.std(parts, ddof=1) / np.sqrt(count)))
+        parts = [part.mean() for part in np.array_split(power, _PARTS)]
+        std, error = root(float(power.mean()), float(np.std(parts, ddof=1) / np.sqrt(_PARTS)))
         return cls(setting.clock_rate, std), {'clock_rate': None, 'period_std': error}
 
     def in_timing(self, setting: Setting) -> Array:

@@ -26,7 +26,7 @@ from sa_jitter_ros.arrays import Array
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
-    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, possible, RARE)
+    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, possible, RARE, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import coarsest_clock
@@ -193,7 +193,7 @@ def _bound(timing: Timing, name: str, far: float) -> Array | None:
         if not seen > 0.0:
             return None
         # right if the power that is seen, and its standard error, do not depend on the one held
-        step = math.log(max(seen + more + far, 1.0) / seen)
+        step = math.log(max(seen + more + far, SEEN) / seen)
         low, high = (at, high) if step > 0.0 else (low, at)
         if abs(step) < _EXACT or high - low < _EXACT:
             break

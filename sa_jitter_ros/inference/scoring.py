@@ -42,6 +42,7 @@ from scipy import special
 #: Acquisitions that fitting and scoring take: of so many, two fit and two are held out.
 FEWEST_ACQUISITIONS = 4
 _HELD_OUT = 6  # acquisitions: up to half of few ones, a third of many
+_FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 
 @dataclass(frozen=True)
@@ -238,8 +239,9 @@ class Bench:
                                   / (expected.attenuation_variance + variance))),
                     float(np.mean(wider))))
         if findings:
+            doubt = min(doubt, 2.0 / _FREEDOM)
             level = level + sum(item.mean**2 for item in moved) + (
-                min(doubt, 1.0) * expected.amplitude_variance.mean(axis=0))
+                doubt / (1.0 - doubt) * expected.amplitude_variance.mean(axis=0))
             expected = self.expect(effects, self.held_out,
                                    unsteadiness=np.sqrt(level + unsteadiness**2))
         return residual(

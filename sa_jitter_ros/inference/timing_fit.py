@@ -34,6 +34,7 @@ SHAFT, JITTER = 'shaft', 'jitter_scale'
 # Frequencies at which the spectrum of the motion is free.
 _KNOTS = 5
 _EDGE_SLOPE = 1.4  # of the motion beyond half the trigger rate
+_MEMORIES = 3.0  # least number of memories in a stretch: longer ones look like a drift
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 
 
@@ -111,8 +112,7 @@ class TimingFit:
         for name, item in self.spectra.items():
             lower = tuple(np.log(1.0 / self.data.longest) if low is None else low
                           for low in item.lower)
-            # no memory is longer than a stretch
-            upper = tuple(math.atanh(math.exp(-1.0 / self.data.longest))
+            upper = tuple(math.atanh(math.exp(-_MEMORIES / self.data.longest))
                           if high is None else high for high in item.upper)
             blocks[name] = item.starts[0], lower, upper
         self.place, begin = {}, 0
