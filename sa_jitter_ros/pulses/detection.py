@@ -132,7 +132,7 @@ class KeyphasorDetector:
         self._edge, self._interpolate = edge, interpolate
         self._minimum_interval, self._learning_time = minimum_interval, learning_time
         self._minimum_difference = minimum_difference
-        #: Whether there is time to see more of a signal that does not rest at its first levels.
+        #: Whether more of a signal that does not rest at its first levels can be waited for.
         self.patient = False
         self._learns = threshold is None or hysteresis > 0.0 or polarity == 'auto'
         self.reset()
@@ -195,9 +195,9 @@ class KeyphasorDetector:
 
     def flush(self) -> FloatArray:
         """Return the pulse times (s) in samples that wait for levels, at a recording's end."""
-        size, found = self._held, _NONE
+        size, found, self.patient = self._held, _NONE, False
         while size and self._levels is None:
-            found = self._learn(size, whole=size < self._held, early=False)
+            found = self._learn(size, whole=size < self._held)
             size = size // 2 if size > self._shortest else 0
         self._end()
         return found
@@ -219,14 +219,14 @@ class KeyphasorDetector:
             self._window = _last(self._window, self._held)
         return found
 
-    def _hum(self, levels: StateLevels, *, early: bool) -> bool:
+    def _hum(self, levels: StateLevels) -> bool:
         """Return whether there may be more than these levels in the samples that wait."""
-        if early and self.patient and self._held < _SLOW * self._shortest:
+        if self.patient and self._held < _SLOW * self._shortest:
             return True
         every = np.concatenate([part for *_, part in self._window])[::self._held // _READ + 1]
         return bool(np.ptp(np.quantile(every, [_FEW, 1 - _FEW])) > _BEYOND_HUM * levels.difference)
 
-    def _learn(self, size: int, *, whole: bool, early: bool = True) -> FloatArray:
+    def _learn(self, size: int, *, whole: bool) -> FloatArray:
         """Learn the levels from the last samples; return the pulses that waited for them."""
         window = np.concatenate([part for *_, part in _last(self._window, size)])
         window = window[::math.ceil(size / max(_READ, self._shortest))]
@@ -239,7 +239,7 @@ class KeyphasorDetector:
         stopped = known and self._confirmed and (slow or not levels.pulsed) and (
             levels.difference < _STOPPED * known.difference)
         if stopped or not useful or (whole and not whole_pulses(window, levels)) or (
-                not known and not levels.pulsed and self._hum(levels, early=early)):
+                not known and not levels.pulsed and self._hum(levels)):
             return _NONE
         waiting, self._window, self._held = self._window, [], 0
         if known is None:
